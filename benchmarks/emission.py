@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from quality import FILES, MACHINES
 from readback import DT_S, find_input, plain_copy, read_motion, shared_folder
 
 from stillpath.gcode.pieces import Piece
@@ -31,10 +32,7 @@ from stillpath.pipeline.options import Options
 from stillpath.pipeline.order import Order
 from stillpath.pipeline.piece_compensator import CompensatedPiece
 from stillpath.pipeline.result import Result
-from stillpath.pipeline.verbatim import last_length_mm
 
-FILES = ("ps_voron_klipper_ringing", "cura_ender3_gear24", "klipper_excludeobj_multi")
-MACHINES = ("ender3", "voron-v0", "voron-v24-250", "annex-k3")
 _BIN_UM, _BINS = 0.01, 40_000
 
 
@@ -111,8 +109,7 @@ class Watched(Job):
         stretch_s = float(timeline.end_s[-1] - timeline.start_s[-1])
         self.late_s += taken_s - (float(encoded.group_start_s[-1]) + stretch_s - origin_s)
         self.off_grid_s += taken_s - (float(timeline.end_s[-1]) - origin_s)
-        end = executed.start_mm[-1] + executed.direction[-1] * last_length_mm(executed)
-        gap_mm = float(np.max(np.abs(end[:3] - piece.moves.end_mm[-1, :3])))
+        gap_mm = float(np.max(np.abs(executed.end_mm[-1, :3] - piece.moves.end_mm[-1, :3])))
         self.end_mm = max(self.end_mm, gap_mm)
 
 

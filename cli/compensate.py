@@ -111,7 +111,7 @@ def simulate(
     if live:
         from stillpath.pipeline.live_printing import simulate_live as simulated
     else:
-        from stillpath.pipeline.compensate import simulate_file as simulated
+        from stillpath.pipeline.simulate import simulate_file as simulated
     with progress_shown() as progress:
         result = simulated(
             source,

@@ -101,7 +101,7 @@ def plan(
     found = open_machines().for_job(machine, files=True)
 
     from stillpath.cli.console import print_planned, progress_shown
-    from stillpath.pipeline.compensate import plan_file
+    from stillpath.pipeline.simulate import plan_file
 
     with progress_shown() as progress:
         planned = plan_file(

@@ -165,14 +165,12 @@ def robust_basis(gram: Array, mean: Array, n: int, r: int | None = None) -> Arra
     return orthonormal(functions[:, :n])
 
 
-def robust_functions(
-    gram: Array, mean: Array, r: int | None = None, tolerance: float = TOLERANCE
-) -> tuple[Array, Array]:
+def robust_functions(gram: Array, mean: Array, r: int | None = None) -> tuple[Array, Array]:
     """Order what a plant set answers by how much all of it agrees there.
 
     Parameters
     ----------
-    gram, mean, r, tolerance
+    gram, mean, r
         As `robust_basis` takes them.
 
     Returns
@@ -186,12 +184,12 @@ def robust_functions(
     m = len(gram)
     squared, w = np.linalg.eigh(gram)
     squared, w = squared[::-1], w[:, ::-1]
-    answered = int(np.sum(squared > (tolerance * tolerance) * squared[0]))
+    answered = int(np.sum(squared > TOLERANCE**2 * squared[0]))
     kept = answered if r is None else m - r
     if not 1 <= kept <= answered:
         raise DesignError(
             f"r = {r} of {m} directions left out, but {m - answered} are answered by less than "
-            f"{tolerance:g} of the largest: take {m - answered} to {m - 1}, or leave r out"
+            f"{TOLERANCE:g} of the largest: take {m - answered} to {m - 1}, or leave r out"
         )
     scaled = w[:, :kept] / np.sqrt(squared[:kept])
     seen = mean @ scaled

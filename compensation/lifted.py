@@ -131,15 +131,12 @@ def free_response(plant: DiscretePlant, samples: int) -> Array:
     return out
 
 
-def integrated(markov: ArrayLike, times: int = 2) -> Array:
-    """Return the Markov parameters, (m,) or (l, m), with integrators in front of the plant.
+def integrated(markov: ArrayLike) -> Array:
+    """Return the Markov parameters, (m,) or (l, m), with two integrators in front of the plant.
 
-    With two, the input is the second difference of the command: the plant of limited preview.
+    The input is then the second difference of the command: the plant of limited preview.
     """
-    out = np.array(markov, np.float64)
-    for _ in range(times):
-        out = np.cumsum(out, axis=-1)
-    return out
+    return np.cumsum(np.cumsum(np.asarray(markov, np.float64), axis=-1), axis=-1)
 
 
 def lifted_set(markov: ArrayLike, weights: ArrayLike) -> LiftedSet:

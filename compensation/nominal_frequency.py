@@ -135,20 +135,20 @@ class FrequencyNominal:
         markov[:used] = self.markov[:used]
         return ToeplitzOperator(markov, self.ahead[: samples - 1])
 
-    def causal(self, limit: float = CAUSAL_SHARE) -> Array:
+    def causal(self) -> Array:
         """Return taps of a stable causal filter for G_r, shape (points / 2,).
 
         Raises
         ------
         DesignError
-            If more than `limit` of the response's energy lies ahead of time: a causal filter with
-            this frequency response would be unstable, or there is none.
+            If more than `CAUSAL_SHARE` of the response's energy lies ahead of time: a causal filter
+            with this frequency response would be unstable, or there is none.
         """
-        if self.ahead_share > limit:
+        if self.ahead_share > CAUSAL_SHARE:
             raise DesignError(
                 f"G_r is not a stable causal filter: {self.ahead_share:.2%} of its response lies "
-                f"ahead of time, limit {limit:.2%}. Take it two-sided (operator), or delay it "
-                f"(delayed) by {self.needed_delay(limit)} samples and the path with it"
+                f"ahead of time, limit {CAUSAL_SHARE:.2%}. Take it two-sided (operator), or delay "
+                f"it (delayed) by {self.needed_delay()} samples and the path with it"
             )
         return self.markov.copy()
 

@@ -2,13 +2,31 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stillpath.models.jit import kernel
 
-__all__ = ["distances", "sweep", "visit"]
+__all__ = ["Plan", "distances", "sweep", "visit"]
+
+Array = NDArray[np.float64]
+
+
+class Plan(NamedTuple):
+    """What positions take of `gcode.types.Phases`."""
+
+    t_s: Array
+    accel_s: Array
+    cruise_s: Array
+    decel_s: Array
+    start_mm: Array
+    direction: Array
+    start_mm_s: Array
+    cruise_mm_s: Array
+    accel_mm_s2: Array
+    s_curve: NDArray[np.bool_]
 
 
 @kernel(allocates=False)
@@ -20,16 +38,7 @@ def sweep(
     row: Any,
     until: Any,
     inside: Any,
-    t_s: Any,
-    accel_s: Any,
-    cruise_s: Any,
-    decel_s: Any,
-    start_mm: Any,
-    direction: Any,
-    start_mm_s: Any,
-    cruise_mm_s: Any,
-    accel_mm_s2: Any,
-    s_curve: Any,
+    plan: Plan,
 ) -> None:
     """Fill `position` and `row` (n) at t0 + (first + k) dt.
 
@@ -37,7 +46,7 @@ def sweep(
     the tool stands where the phase before ended. `inside` (n), or nothing, tells which samples are
     not later than `until` of their phase.
     """
-    moves = len(t_s)
+    moves = len(plan.t_s)
     count = len(row)
     axes = len(position)
     k = 0
@@ -45,7 +54,7 @@ def sweep(
         # Samples k..stop - 1 belong to this move.
         stop = count
         if m + 1 < moves:
-            next_s = t_s[m + 1]
+            next_s = plan.t_s[m + 1]
             stop = _place(next_s, t0_s, dt_s, first, k, count)
             while stop > k and t0_s + (first + stop - 1) * dt_s >= next_s:
                 stop -= 1
@@ -53,11 +62,10 @@ def sweep(
                 stop += 1
         if stop == k:
             continue
-        begin, accel, cruise, decel = t_s[m], accel_s[m], cruise_s[m], decel_s[m]
-        v0, v1, rate = start_mm_s[m], cruise_mm_s[m], accel_mm_s2[m]
+        begin, accel, cruise, decel, v0, v1, rate, eased = _move(plan, m)
         # Each part of the move by itself, so that a sample asks nothing: the way goes to x first.
         way, number = position[0, k:stop], first + k
-        if s_curve[m]:
+        if eased:
             for i in range(len(way)):
                 left = t0_s + (number + i) * dt_s - begin
                 way[i] = _way(left, accel, cruise, decel, v0, v1, rate, True)
@@ -78,7 +86,8 @@ def sweep(
                 way[i] = lifted + (v1 - 0.5 * rate * falling) * falling
         way = position[0, k:stop]
         for axis in range(axes - 1, -1, -1):
-            along, origin, slope = position[axis, k:stop], start_mm[m, axis], direction[m, axis]
+            along = position[axis, k:stop]
+            origin, slope = plan.start_mm[m, axis], plan.direction[m, axis]
             for i in range(len(way)):
                 along[i] = origin + slope * way[i]
         row[k:stop] = m
@@ -87,6 +96,21 @@ def sweep(
             for i in range(len(part)):
                 part[i] = t0_s + (number + i) * dt_s <= last_s
         k = stop
+
+
+@kernel(inline=True, allocates=False)
+def _move(plan: Plan, m: int) -> tuple[float, float, float, float, float, float, float, bool]:
+    """Return begin, lengths of the three phases, speeds, acceleration and shape of a move."""
+    return (
+        plan.t_s[m],
+        plan.accel_s[m],
+        plan.cruise_s[m],
+        plan.decel_s[m],
+        plan.start_mm_s[m],
+        plan.cruise_mm_s[m],
+        plan.accel_mm_s2[m],
+        plan.s_curve[m],
+    )
 
 
 @kernel(inline=True, allocates=False)
@@ -124,34 +148,17 @@ def visit(
     times: Any,
     position: Any,
     row: Any,
-    t_s: Any,
-    accel_s: Any,
-    cruise_s: Any,
-    decel_s: Any,
-    start_mm: Any,
-    direction: Any,
-    start_mm_s: Any,
-    cruise_mm_s: Any,
-    accel_mm_s2: Any,
-    s_curve: Any,
+    plan: Plan,
 ) -> None:
     """Fill `position` and `row` (n) as `sweep` does, at rising `times`."""
     m = 0
     for i in range(len(times)):
-        while m + 1 < len(t_s) and times[i] >= t_s[m + 1]:
+        while m + 1 < len(plan.t_s) and times[i] >= plan.t_s[m + 1]:
             m += 1
-        path = _way(
-            times[i] - t_s[m],
-            accel_s[m],
-            cruise_s[m],
-            decel_s[m],
-            start_mm_s[m],
-            cruise_mm_s[m],
-            accel_mm_s2[m],
-            s_curve[m],
-        )
+        begin, accel, cruise, decel, v0, v1, rate, eased = _move(plan, m)
+        path = _way(times[i] - begin, accel, cruise, decel, v0, v1, rate, eased)
         for axis in range(len(position)):
-            position[axis, i] = start_mm[m, axis] + direction[m, axis] * path
+            position[axis, i] = plan.start_mm[m, axis] + plan.direction[m, axis] * path
         row[i] = m
 
 
@@ -163,26 +170,17 @@ def distances(
     until_s: Any,
     points: Any,
     out: Any,
-    t_s: Any,
-    accel_s: Any,
-    cruise_s: Any,
-    decel_s: Any,
-    start_mm: Any,
-    direction: Any,
-    start_mm_s: Any,
-    cruise_mm_s: Any,
-    accel_mm_s2: Any,
-    s_curve: Any,
+    plan: Plan,
 ) -> None:
     """Fill `out` (n) with the distance in x y between `points` (2, n) and the tool.
 
     The points from `first[g]` on, up to the next of these, belong to k dt + late, `until` at the
     latest. Time never goes back.
     """
+    t_s, start_mm, direction = plan.t_s, plan.start_mm, plan.direction
     moves, count = len(t_s), len(out)
     m = 0
-    begin, accel, cruise, decel = t_s[0], accel_s[0], cruise_s[0], decel_s[0]
-    v0, v1, rate, eased = start_mm_s[0], cruise_mm_s[0], accel_mm_s2[0], s_curve[0]
+    begin, accel, cruise, decel, v0, v1, rate, eased = _move(plan, 0)
     x, y, dx, dy = start_mm[0, 0], start_mm[0, 1], direction[0, 0], direction[0, 1]
     next_s = t_s[1] if moves > 1 else np.inf
     t = -np.inf
@@ -193,8 +191,7 @@ def distances(
             if t >= next_s:
                 while m + 1 < moves and t >= t_s[m + 1]:
                     m += 1
-                begin, accel, cruise, decel = t_s[m], accel_s[m], cruise_s[m], decel_s[m]
-                v0, v1, rate, eased = start_mm_s[m], cruise_mm_s[m], accel_mm_s2[m], s_curve[m]
+                begin, accel, cruise, decel, v0, v1, rate, eased = _move(plan, m)
                 x, y, dx, dy = start_mm[m, 0], start_mm[m, 1], direction[m, 0], direction[m, 1]
                 next_s = t_s[m + 1] if m + 1 < moves else np.inf
             path = _way(t - begin, accel, cruise, decel, v0, v1, rate, eased)

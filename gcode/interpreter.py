@@ -29,7 +29,7 @@ from stillpath.gcode.state import MachineState, nobody
 from stillpath.gcode.types import KEPT, EventKind, Events, Limits, ModalState, Moves, ProgramBlock
 from stillpath.models.machine import Machine
 
-__all__ = ["Interpreter", "interpret_bytes"]
+__all__ = ["Interpreter"]
 
 _BOM = b"\xef\xbb\xbf"
 _BOM_16 = (b"\xff\xfe", b"\xfe\xff")
@@ -425,20 +425,6 @@ class Interpreter:
         raise GcodeError(
             message, line=int(i[at.I_LINE]), text=self._raw().decode("utf-8", "replace")
         )
-
-
-def interpret_bytes(
-    data: bytes, machine: Machine, *, strict_bounds: bool = True, dialect: Dialect | None = None
-) -> list[ProgramBlock]:
-    """Interpret a whole file.
-
-    Raises
-    ------
-    GcodeError
-        For a line that the firmware would reject or that leaves the travel.
-    """
-    interpreter = Interpreter(machine, strict_bounds=strict_bounds, dialect=dialect)
-    return [*interpreter.push(data), *interpreter.flush()]
 
 
 _MESSAGES = {

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillpath.gcode import _sample_kernels as kernels
-from stillpath.gcode.types import Phases, joined
+from stillpath.gcode.types import Phases, joined, rows_of
 
 __all__ = ["Sampler", "Samples", "distances", "sample_phases", "sample_until"]
 
@@ -94,7 +94,7 @@ def sample_phases(
     if times.ndim != 1 or not np.all(np.isfinite(times)) or np.any(np.diff(times) < 0):
         raise ValueError("the sampling times must be finite and ascending")
     position, row = np.empty((axes, len(times))), np.empty(len(times), np.int64)
-    kernels.visit(times, position, row, *_columns(phases))
+    kernels.visit(times, position, row, _plan(phases))
     return position, row
 
 
@@ -154,7 +154,7 @@ def distances(
     """
     _check(phases)
     out = np.empty(points_mm.shape[1])
-    kernels.distances(dt_s, first, late_s, until_s, points_mm, out, *_columns(phases))
+    kernels.distances(dt_s, first, late_s, until_s, points_mm, out, _plan(phases))
     return out
 
 
@@ -178,7 +178,7 @@ class Sampler:
         """Take the next phases; yield the samples up to the end of the last of them."""
         if len(phases):
             known = phases if self._last is None else joined([self._last, phases])
-            self._last = _tail(phases)
+            self._last = rows_of(phases, [-1])  # a copy: a view would keep all of them
             # A sample that falls on the end belongs to what comes next.
             yield from self._sample(known, math.ceil(phases.end_s[-1] / self.dt_s))
 
@@ -215,31 +215,14 @@ def _sweep(
     inside: NDArray[np.bool_] = _NO_MARKS,
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     row = np.empty(position.shape[1], np.int64)
-    kernels.sweep(t0_s, dt_s, first, position, row, until_s, inside, *_columns(phases))
+    kernels.sweep(t0_s, dt_s, first, position, row, until_s, inside, _plan(phases))
     return position, row
 
 
-def _columns(phases: Phases) -> tuple[NDArray[np.float64] | NDArray[np.bool_], ...]:
-    """Return what the kernels take of phases."""
-    return (
-        phases.t_s,
-        phases.accel_s,
-        phases.cruise_s,
-        phases.decel_s,
-        phases.start_mm,
-        phases.direction,
-        phases.start_mm_s,
-        phases.cruise_mm_s,
-        phases.accel_mm_s2,
-        phases.s_curve,
-    )
+def _plan(phases: Phases) -> kernels.Plan:
+    return kernels.Plan(*(getattr(phases, name) for name in kernels.Plan._fields))
 
 
 def _check(phases: Phases) -> None:
     if len(phases) == 0:
         raise ValueError("nothing to sample: there are no phases")
-
-
-def _tail(phases: Phases) -> Phases:
-    """Copy the last phase."""
-    return Phases(*(getattr(phases, name)[-1:].copy() for name in Phases.__dataclass_fields__))

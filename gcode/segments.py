@@ -9,8 +9,9 @@ machine's resonances, and is steered to where the machine does not answer.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -69,6 +70,17 @@ class Segments:
 
     def __len__(self) -> int:
         return len(self.end_s)
+
+    @property
+    def final(self) -> NDArray[np.bool_]:
+        """Which segments end their stretch, shape (n,)."""
+        return np.append(self.group[1:] != self.group[:-1], True)
+
+    def stretches(self) -> Iterator[tuple[int, slice]]:
+        """Yield the group and the rows of every stretch, in order."""
+        if len(self):
+            for first, stop in pairwise([0, *(np.flatnonzero(self.final) + 1).tolist()]):
+                yield int(self.group[first]), slice(first, stop)
 
 
 class ErrorFilter:

@@ -173,9 +173,9 @@ class MachineState:
         if origin:
             self.i[at.I_ORIGIN_KNOWN] &= ~axes
 
-    def travel(self, *, named: int = 0, trusted: bool = False) -> int:
-        """Go to F_LAST. Without `trusted` the line is more than a plain move, and stays."""
-        return travel(self.f, self.i, named, trusted, self.rows)
+    def travel(self) -> int:
+        """Go to F_LAST for a line that is more than a plain move, and stays."""
+        return travel(self.f, self.i, 0, False, self.rows)
 
     def travel_to_kept(self) -> int:
         """Go to F_LAST for a line that depends on what the printer keeps, its F for one."""

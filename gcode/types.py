@@ -267,6 +267,18 @@ class Phases:
         return float(self.t_s[-1] + last_s - self.t_s[0])
 
     @property
+    def length_mm(self) -> NDArray[np.float64]:
+        """Way of each move along its path, shape (n,)."""
+        begin, top, end = self.start_mm_s, self.cruise_mm_s, self.end_mm_s
+        ramps = (begin + top) * self.accel_s + (top + end) * self.decel_s
+        return np.asarray(0.5 * ramps + top * self.cruise_s)
+
+    @property
+    def end_mm(self) -> NDArray[np.float64]:
+        """Where each move ends, x y z e, shape (n, 4)."""
+        return np.asarray(self.start_mm + self.direction * self.length_mm[:, None])
+
+    @property
     def moves_xy(self) -> NDArray[np.bool_]:
         """Which moves change X or Y, shape (n,)."""
         return _moves_xy(self.direction)
@@ -289,8 +301,8 @@ def _prints(travel: NDArray[np.float64]) -> NDArray[np.bool_]:
 _Table = TypeVar("_Table", Moves, Events, Phases)
 
 
-def rows_of(table: _Table, rows: slice) -> _Table:
-    """Return some rows of a table."""
+def rows_of(table: _Table, rows: slice | list[int] | NDArray[np.int64]) -> _Table:
+    """Return some rows of a table; of a slice, they are the same in memory."""
     return type(table)(**{f.name: getattr(table, f.name)[rows] for f in fields(table)})
 
 

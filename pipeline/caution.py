@@ -40,13 +40,13 @@ __all__ = [
     "caution_for",
     "choose_caution",
     "design_mode",
-    "designed",
     "error_ranges",
     "measured_set",
     "member_pairs",
     "most_share",
     "pair_weights",
     "prediction_note",
+    "set_or_nominal",
     "stated_note",
 ]
 
@@ -146,22 +146,20 @@ def measured_set(axis: PlantSetSpec) -> bool:
     return members and stated_hz(axis) is None
 
 
-def design_mode(machine: Machine, options: Options) -> str:
-    """Return the robust mode of `compensation.fbf.PreviewFbf` that the options ask for."""
-    if options.robust != "auto":
-        return options.robust
+def design_mode(machine: Machine) -> str:
+    """Return the robust mode of `compensation.fbf.PreviewFbf` that `robust=auto` tries first."""
     return "ensemble" if any(map(measured_set, machine.axes.values())) else "off"
 
 
-def designed(options: Options, mode: str, design: Callable[[str], T]) -> T:
-    """Return the design of a mode, or by default of the plants in the middle if it refuses itself.
+def set_or_nominal(mode: str, design: Callable[[str], T]) -> T:
+    """Return the design of a robust mode, or of the nominal plants where the set refuses itself.
 
-    Plants that ring for longer than any window make a set refuse itself.
+    Plants that ring for longer than any window make it do so.
     """
     try:
         return design(mode)
     except DesignError:
-        if options.robust != "auto" or mode == "off":
+        if mode == "off":
             raise
         return design("off")
 
@@ -170,8 +168,7 @@ def caution_for(
     machine: Machine, options: Options, shaper: BestShaper, directory: Path, dt_s: float
 ) -> tuple[Caution, Choice] | None:
     """Return the default's share of the shaper, and why; None without a shaper."""
-    vibration = options.method.removesuffix("+ripple")
-    if vibration != "fbf" or options.robust != "auto":
+    if options.vibration != "fbf" or options.robust != "auto":
         return None
     measured = any(map(measured_set, machine.axes.values()))
     # Who knows how a resonance moves during a print knows more of it than where it is.
@@ -319,10 +316,8 @@ def _commands(
     ).compensate(path, extruding, _NO_RESTS)
     if not fbf:
         return smooth, smooth
-    exact = designed(
-        Options(),
-        "ensemble",
-        lambda mode: PreviewFbf(_strong(machine), dt_s, basis=basis, robust=mode),
+    exact = set_or_nominal(
+        "ensemble", lambda mode: PreviewFbf(_strong(machine), dt_s, basis=basis, robust=mode)
     )
     exact.reset(path[:, 0])
     return exact.compensate(path, extruding, _NO_RESTS), smooth

@@ -24,9 +24,8 @@ from stillpath.pipeline.pacing.budget import SpeedBudget
 from stillpath.pipeline.progress import ProgressCallback
 from stillpath.pipeline.result import Result
 from stillpath.pipeline.selection import TooLarge, smaller
-from stillpath.pipeline.simulate import plan_file, simulate_file
 
-__all__ = ["compensate_file", "plan_file", "simulate_file"]
+__all__ = ["compensate_file"]
 
 
 def compensate_file(
@@ -120,7 +119,7 @@ def _final_job(
     A piece that the last check refuses stays as sliced, as one that any other check refuses.
     """
     # Within a budget a file may be written more than once: only the last time is traced.
-    again = Job.has_budget(order.options) or order.options.max_mb is not None
+    again = order.options.paced or order.options.max_mb is not None
     traced = None if again else trace
     budget: SpeedBudget | None = None
     layers = file.layers
@@ -139,7 +138,7 @@ def _final_job(
             budget = budget and budget.again()
         else:
             if gentler is None:
-                traced = trace
+                traced = trace  # the file is good: once more as it is, for the trace
             budget = gentler or job.same
         file.spool.seek(0)
         file.spool.truncate()

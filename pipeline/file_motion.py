@@ -24,8 +24,9 @@ from stillpath.models.machine import Machine
 from stillpath.models.shaping import OFF, Shaping
 from stillpath.pipeline.endless import LengthGuard
 from stillpath.pipeline.measuring.points import MotionSamples
+from stillpath.pipeline.options import DialectName
 from stillpath.pipeline.progress import ProgressCallback, ProgressReports, progress_to
-from stillpath.pipeline.reading import DialectName, dialect_for, doubts, passed_over
+from stillpath.pipeline.reading import dialect_for, doubts, passed_over
 
 __all__ = ["STANDING_S", "FileMotion", "MotionPart", "TextMotion"]
 

@@ -12,7 +12,7 @@ from typing import BinaryIO
 from stillpath.gcode.containers.opening import Container, open_text, rewriting
 from stillpath.pipeline.files import replacing
 from stillpath.pipeline.measuring.layer_files import LayerWriter, written_layers
-from stillpath.pipeline.measuring.measure import channel_names
+from stillpath.pipeline.measuring.measure import CHANNELS
 from stillpath.pipeline.progress import ProgressCallback, progress_to
 
 __all__ = ["FileRewriting", "file_rewriting"]
@@ -72,8 +72,7 @@ def file_rewriting(
         ):
             writer = None
             if layers is not None:
-                names = channel_names(compensated=True)
-                writer = files.enter_context(written_layers(layers, names))
+                writer = files.enter_context(written_layers(layers, CHANNELS))
             made = FileRewriting(container, text, spool, writer)
             yield made
         # Before the target is put in place: it may be the source.

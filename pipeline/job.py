@@ -36,13 +36,13 @@ from stillpath.pipeline.endless import LengthGuard
 from stillpath.pipeline.files import Discarding, default_cache_dir
 from stillpath.pipeline.last_check.comparing import LastCheck
 from stillpath.pipeline.measuring.layer_files import LayerWriter
-from stillpath.pipeline.measuring.measure import Measurement, channel_names
+from stillpath.pipeline.measuring.measure import Measurement
 from stillpath.pipeline.measuring.points import MotionSamples, part_of
 from stillpath.pipeline.measuring.reference_shaper import cached_shaper
 from stillpath.pipeline.measuring.tracing import Trace
 from stillpath.pipeline.motion_record import MotionRecord
 from stillpath.pipeline.operating_point import Operation
-from stillpath.pipeline.options import Options, stamp
+from stillpath.pipeline.options import stamp
 from stillpath.pipeline.order import Order
 from stillpath.pipeline.pacing.budget import SpeedBudget
 from stillpath.pipeline.pacing.budget_measure import BudgetMeasurement
@@ -125,6 +125,7 @@ class Job:
         self._reports = ProgressReports(order.progress)
         self._clock = StageClock()
         self._changes = options.method != "none"
+        self._sum = Totals()
         self._adapter = adapter(machine)
         if self._changes and self._adapter.refusal is not None:
             raise ModelError(f"{machine.name} cannot execute this file: {self._adapter.refusal}")
@@ -137,9 +138,15 @@ class Job:
         self._selection = Selection(options.where, machine)
         self._operation = Operation(machine)
         self._budget = budget
-        self._pairs: BudgetMeasurement | None = None
-        self._measurement = self._measuring(trace)
-        self._sum = Totals()
+        measures = BudgetMeasurement if options.paced else Measurement
+        self._measurement = measures(
+            machine,
+            DT_S,
+            self._shaper,
+            take_layer=layers.add if layers else None,
+            trace=trace,
+            size=source.seek(0, io.SEEK_END),
+        )
         changing = None
         if self._changes:
             self._verifier = Verifier(machine, options.tolerance_um)
@@ -169,24 +176,10 @@ class Job:
         if tuned_first or self._caution is not None:
             self._work = PieceCompensator(machine, options, self._shaper, self._caution)
 
-    def _measuring(self, trace: Callable[[Trace], None] | None) -> Measurement:
-        """Return the measurement of the written file; with a budget, of every pace as well."""
-        take_layer = self._layers.add if self._layers else None
-        size = self._source.seek(0, io.SEEK_END)
-        if self.has_budget(self._options):
-            self._pairs = BudgetMeasurement(
-                self._machine, DT_S, self._shaper, take_layer=take_layer, trace=trace, size=size
-            )
-            return self._pairs
-        names = channel_names(compensated=True)
-        return Measurement(
-            self._machine, DT_S, self._shaper, names, take_layer=take_layer, trace=trace, size=size
-        )
-
-    @staticmethod
-    def has_budget(options: Options) -> bool:
-        """Return whether paces are chosen."""
-        return options.budget_um is not None and options.method != "none"
+    @property
+    def _pairs(self) -> BudgetMeasurement | None:
+        """The measurement, where it is one of both paces."""
+        return self._measurement if isinstance(self._measurement, BudgetMeasurement) else None
 
     @property
     def gentler(self) -> SpeedBudget | None:
@@ -287,21 +280,18 @@ class Job:
         delay_s = self.delay_s
         self._sum.pieces += 1
         self._sum.moves += len(piece.moves)
-        original_s = piece.phases.duration_s
-        self._check_end(piece, original_s)
-        self._sum.original_s += original_s
+        self._check_end(piece, piece.phases.duration_s)
+        self._sum.original_s += piece.phases.duration_s
         lines = int(piece.moves.line[0]), int(piece.moves.line[-1])
+        paces = iter((piece,)) if self._budget is None else self._budget.paced(piece)
         refusal = self._order.refusal(*lines)
         if refusal is not None:
-            if self._budget is not None:
-                next(self._budget.paced(piece))  # which counts it
-            self._put_back(piece, original_s, refusal)
+            next(paces)  # which counts what it takes with the shaper
+            self._put_back(piece, refusal)
             return
         self._motion.begin(piece)
         switched_s = self._switched_off_s()
-        for paced in (
-            self._clock.each("plan", self._budget.paced(piece)) if self._budget else (piece,)
-        ):
+        for paced in self._clock.each("plan", paces):
             try:
                 attempt = self._attempt(piece, paced)
                 break
@@ -311,7 +301,7 @@ class Job:
                 reason = f"the firmware would refuse the compensated lines: {error.message}"
         else:
             self._sum.time_s -= switched_s
-            self._put_back(piece, original_s, reason)
+            self._put_back(piece, reason)
             return
         self.compensated.append(lines)
         self._work.compensator.commit()
@@ -375,9 +365,9 @@ class Job:
             ) from error
         return Attempt(made, executed, gap_mm, text, motion)
 
-    def _put_back(self, piece: Piece, seconds: float, reason: str) -> None:
-        """Let a piece stay as sliced."""
-        phases = piece.phases
+    def _put_back(self, piece: Piece, reason: str) -> None:
+        """Let a piece stay as sliced; what it was counted for is taken back."""
+        phases, seconds = piece.phases, piece.phases.duration_s
         extruding_s = float(np.sum(phases.lasts_s[phases.prints]))
         self._sum.put_back.append(
             PutBack(
@@ -442,7 +432,7 @@ class Job:
         self.retiming.push(text, item, delay_s)
 
     def _say(self, stage: str, fraction: float) -> None:
-        self._reports.say(stage, fraction, self._sum.time_s if hasattr(self, "_sum") else 0.0)
+        self._reports.say(stage, fraction, self._sum.time_s)
 
     def _summary(self) -> Summary:
         budget = None

@@ -18,10 +18,9 @@ from stillpath.pipeline.live_motion import LiveMotion
 from stillpath.pipeline.measuring.measure import Measurement
 from stillpath.pipeline.measuring.tracing import Trace
 from stillpath.pipeline.operating_point import Operation
-from stillpath.pipeline.options import Options
+from stillpath.pipeline.options import DialectName, Options
 from stillpath.pipeline.piece_compensator import DT_S
 from stillpath.pipeline.progress import Progress, ProgressCallback
-from stillpath.pipeline.reading import DialectName
 from stillpath.pipeline.result import PrintWay, Result, StageTime
 from stillpath.pipeline.simulate import measured, simulate_motion
 from stillpath.pipeline.ways import file_way, live_way

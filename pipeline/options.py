@@ -104,6 +104,16 @@ class Options(BaseModel):
     max_mb: MaxMb | None = None
     compare_live: bool = False
 
+    @property
+    def vibration(self) -> str:
+        """The method without what it does against ripple."""
+        return self.method.removesuffix("+ripple")
+
+    @property
+    def paced(self) -> bool:
+        """Whether the print gets new speeds."""
+        return self.budget_um is not None and self.method != "none"
+
     @model_validator(mode="after")
     def _one_way(self) -> Options:
         if self.compare_live and self.method.split("+")[0] in ("advise", "live", "none"):
@@ -146,7 +156,7 @@ class Options(BaseModel):
 def unused(options: Options) -> list[str]:
     """Return a sentence for the choices of a job that its method has no use for."""
     method = options.method
-    names = [] if method.removesuffix("+ripple") == "fbf" else ["basis", "robust", "along"]
+    names = [] if options.vibration == "fbf" else ["basis", "robust", "along"]
     if method in _AS_SLICED:
         names.append("tolerance_um")
     if method == "none":

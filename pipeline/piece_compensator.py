@@ -27,7 +27,7 @@ from stillpath.models.operating import OperatingGrid, machine_at
 from stillpath.models.plants import plant_set
 from stillpath.models.runs import runs
 from stillpath.models.schedule import EMPTY, OperatingPoint
-from stillpath.pipeline.caution import design_mode, designed
+from stillpath.pipeline.caution import design_mode, set_or_nominal
 from stillpath.pipeline.measuring._peak_kernels import peaks, speed_step
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.pipeline.options import Options
@@ -116,26 +116,10 @@ class PieceCompensator:
         shaper: BestShaper | None = None,
         caution: Caution | None = None,
     ) -> None:
-        settings: dict[str, object] = {}
-        vibration = options.method.removesuffix("+ripple")
-        if vibration == "fbf":
-            settings.update(basis=options.basis, along=options.along)
-            if caution is not None:
-                settings.update(caution=caution)
-        elif shaper is not None and vibration == f"shaper:{shaper.type}":
-            settings.update(fx_hz=shaper.fx_hz, fy_hz=shaper.fy_hz)
         self._machine = machine
+        self.compensator = _designed(machine, options, shaper, caution)
         fit_share = 1.0 if caution is None else caution.fit_share
         self._tolerance_mm = 1e-3 * options.tolerance_um * fit_share
-
-        def design(mode: str | None) -> Compensator:
-            chosen = settings if mode is None else {**settings, "robust": mode}
-            return compensator(options.method, machine, DT_S, **chosen)
-
-        fbf = vibration == "fbf"
-        self.compensator: Compensator = (
-            designed(options, design_mode(machine, options), design) if fbf else design(None)
-        )
         firmware = adapter(machine)
         self.encoder = firmware.encoder()
         self._step_mm = firmware.step_mm
@@ -336,6 +320,25 @@ class PieceCompensator:
                     f"line {line}: the command would take {axis} to {place_mm[i, worst]:.4f} mm, "
                     f"outside {travel.min_mm:.7g} to {travel.max_mm:.7g} mm"
                 )
+
+
+def _designed(
+    machine: Machine, options: Options, shaper: BestShaper | None, caution: Caution | None
+) -> Compensator:
+    """Return the compensator that the options ask for."""
+    if options.vibration == "fbf":
+
+        def design(robust: str) -> Compensator:
+            settings = {"basis": options.basis, "along": options.along, "robust": robust}
+            return compensator(options.method, machine, DT_S, **settings, caution=caution)
+
+        if options.robust == "auto":
+            return set_or_nominal(design_mode(machine), design)
+        return design(options.robust)
+    if shaper is not None and options.vibration == f"shaper:{shaper.type}":
+        hz = {"fx_hz": shaper.fx_hz, "fy_hz": shaper.fy_hz}
+        return compensator(options.method, machine, DT_S, **hz)
+    return compensator(options.method, machine, DT_S)
 
 
 def _mean(path_mm: NDArray[np.float64], reach: int) -> NDArray[np.float64]:

@@ -14,7 +14,7 @@ from stillpath.models.firmware import Marlin
 from stillpath.models.machine import Machine
 from stillpath.pipeline.options import DialectName
 
-__all__ = ["DialectName", "dialect_for", "doubts", "passed_over"]
+__all__ = ["dialect_for", "doubts", "passed_over"]
 
 _SHOWN = 5
 _END_BYTES = 1 << 18

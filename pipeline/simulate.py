@@ -20,14 +20,14 @@ from stillpath.pipeline.file_motion import STANDING_S, FileMotion
 from stillpath.pipeline.files import default_cache_dir
 from stillpath.pipeline.live_motion import LiveMotion
 from stillpath.pipeline.measuring.layer_files import written_layers
-from stillpath.pipeline.measuring.measure import Measurement, channel_names
+from stillpath.pipeline.measuring.measure import CHANNELS, UNCHANGED_CHANNELS, Measurement
 from stillpath.pipeline.measuring.points import MotionSamples
 from stillpath.pipeline.measuring.reference_shaper import cached_shaper
 from stillpath.pipeline.measuring.tracing import Trace
 from stillpath.pipeline.operating_point import Operation
+from stillpath.pipeline.options import DialectName
 from stillpath.pipeline.piece_compensator import DT_S
 from stillpath.pipeline.progress import ProgressCallback
-from stillpath.pipeline.reading import DialectName
 from stillpath.pipeline.result import NOTHING_COMPENSATED, Result
 from stillpath.pipeline.shaping import ShapedMotion
 from stillpath.version import __version__
@@ -133,7 +133,7 @@ def simulate_motion(
     with clock.stage("reference shaper"):
         shaper = cached_shaper(machine, cache_dir or default_cache_dir(), DT_S)
     operation = Operation(machine)
-    names = channel_names(compensated=live is not None)
+    names = UNCHANGED_CHANNELS if live is None else CHANNELS
     size = motion.source.stat().st_size
     with contextlib.ExitStack() as files:
         writer = None if layers is None else files.enter_context(written_layers(layers, names))

@@ -11,7 +11,6 @@ from stillpath.gcode.pieces import LeftOut, VerbatimPart
 from stillpath.gcode.types import Phases
 from stillpath.pipeline.piece_compensator import DT_S, CompensatedPiece
 from stillpath.pipeline.result import PutBack
-from stillpath.pipeline.verbatim import last_length_mm
 
 __all__ = ["NOT_COMPENSATED", "Totals"]
 
@@ -54,8 +53,8 @@ class Totals:
         self.gap2 += float(gap @ gap)
         self.gap_count += len(gap)
         self.gap_max = max(self.gap_max, float(np.max(gap, initial=0.0)))
-        end = executed.start_mm[-1, 3] + executed.direction[-1, 3] * last_length_mm(executed)
-        self.filament_error = max(self.filament_error, abs(float(end - made.command_mm[3, -1])))
+        missed_mm = abs(float(executed.end_mm[-1, 3] - made.command_mm[3, -1]))
+        self.filament_error = max(self.filament_error, missed_mm)
 
     def add_verbatim(self, verbatim: VerbatimPart, phases: Phases) -> None:
         """Add motion whose lines are not changed."""

@@ -13,7 +13,7 @@ from stillpath.gcode.plan import plan_moves
 from stillpath.gcode.types import EventKind, Phases, ProgramBlock, rows_of
 from stillpath.models.machine import Machine
 
-__all__ = ["last_length_mm", "plan_verbatim", "switching_s", "takes_s"]
+__all__ = ["plan_verbatim", "switching_s", "takes_s"]
 
 
 def plan_verbatim(verbatim: VerbatimPart, machine: Machine) -> Iterator[Phases | float | None]:
@@ -56,13 +56,3 @@ def takes_s(part: Phases | float | None) -> float:
 def switching_s(parts: Iterable[VerbatimPart | ProgramBlock]) -> float:
     """Return how long the machine stands still because its shaper is switched."""
     return sum(float(np.sum(p.events.dwell_s[p.events.kind == EventKind.SHAPER])) for p in parts)
-
-
-def last_length_mm(phases: Phases) -> float:
-    """Return the length of the last move."""
-    v0, v1, v2 = phases.start_mm_s[-1], phases.cruise_mm_s[-1], phases.end_mm_s[-1]
-    return float(
-        0.5 * (v0 + v1) * phases.accel_s[-1]
-        + v1 * phases.cruise_s[-1]
-        + 0.5 * (v1 + v2) * phases.decel_s[-1]
-    )

@@ -18,7 +18,6 @@ from stillpath.pipeline.piece_compensator import (
     follow_tolerance_mm,
     strayed,
 )
-from stillpath.pipeline.verbatim import last_length_mm
 from stillpath.simulation.measures import MotionMeter
 from stillpath.simulation.scheduled import MachineStream
 
@@ -90,8 +89,7 @@ class Verifier:
             tolerance_mm = np.maximum(tolerance_mm, [self._waits_mm, self._waits_mm, 0.0, 0.0])
         if abs(late_s) > _TIME_EXCESS_S:
             raise Unfit(f"read back, the piece takes {1e3 * late_s:+.2f} ms longer than planned")
-        end = executed.start_mm[-1] + executed.direction[-1] * last_length_mm(executed)
-        wanted = piece.moves.end_mm[-1]
+        end, wanted = executed.end_mm[-1], piece.moves.end_mm[-1]
         if np.any(np.abs(end - wanted) > tolerance_mm):
             raise Unfit(f"read back, the piece ends at {end.round(6)}, not at {wanted.round(6)}")
 

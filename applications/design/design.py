@@ -49,7 +49,6 @@ from stillpath.models.machine import Machine
 from stillpath.models.plants import DiscretePlant, PlantSet, plant_set
 from stillpath.pipeline.caution import design_mode
 from stillpath.pipeline.measuring.reference_shaper import BestShaper, tune_each
-from stillpath.pipeline.options import Options
 from stillpath.version import __version__
 
 __all__ = ["AXES", "ERRORS_PERCENT", "DesignSettings", "design_report"]
@@ -250,7 +249,7 @@ def _robust_mode(
     """Return the mode that is asked for; of ``auto``, the one that jobs take."""
     if settings.robust != "auto":
         return settings.robust
-    mode = design_mode(machine, Options(robust="auto"))
+    mode = design_mode(machine)
     # As jobs do: where a set refuses itself, the plants in the middle are designed for.
     return mode if mode in designers else "off"
 

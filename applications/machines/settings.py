@@ -38,13 +38,13 @@ class MachineSettings(BaseModel):
     measurement_max_age_days: Annotated[float, Field(gt=0)] = 180.0
 
     @classmethod
-    def from_environment(cls, environment: Mapping[str, str] = os.environ) -> Self:
+    def from_environment(cls) -> Self:
         """Read ``STILLPATH_DATA_DIR`` and its like, in upper or lower case.
 
         Plain, because the library for it costs every command a tenth of a second.
         """
         known = {ENV_PREFIX + field.upper(): field for field in cls.model_fields}
-        given = {name.upper(): value for name, value in environment.items()}
+        given = {name.upper(): value for name, value in os.environ.items()}
         return cls.model_validate({known[n]: v for n, v in given.items() if n in known})
 
 

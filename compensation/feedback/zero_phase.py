@@ -27,7 +27,7 @@ __all__ = ["Prefilter", "design_prefilter", "fir_within", "reference_plant"]
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
-_LADDER_STEP = 0.85
+_LADDER_STEP, _SLOWEST_HZ = 0.85, 10.0
 _PREVIEW = 5
 
 
@@ -127,9 +127,7 @@ def fir_within(
     y_d: Array,
     accel_limit: float,
     *,
-    kind: str = "zpetc",
     length: int = _PREVIEW,
-    slowest_hz: float = 10.0,
 ) -> Prefilter:
     """Return the prefilter with the highest cutoff whose reference keeps an acceleration.
 
@@ -143,17 +141,17 @@ def fir_within(
     Raises
     ------
     DesignError
-        If even `slowest_hz` exceeds it.
+        If even 10 Hz exceeds it.
     """
     cutoff_hz, needed = 0.4 / loop.dt_s, 0.0
-    while cutoff_hz >= slowest_hz:
-        made = design_prefilter(loop, kind=kind, cutoff_hz=cutoff_hz, length=length)
+    while cutoff_hz >= _SLOWEST_HZ:
+        made = design_prefilter(loop, cutoff_hz=cutoff_hz, length=length)
         needed = float(np.max(np.abs(np.diff(made.apply(y_d), 2)))) / loop.dt_s**2
         if needed <= accel_limit:
             return made
         cutoff_hz *= _LADDER_STEP
     raise DesignError(
-        f"even with a low-pass at {slowest_hz:g} Hz ({length} samples ahead) the reference needs "
+        f"even with a low-pass at {_SLOWEST_HZ:g} Hz ({length} samples ahead) the reference needs "
         f"an acceleration of {needed:.4g} (limit {accel_limit:.4g}); take a longer low-pass, or "
         "move more slowly"
     )

@@ -1,13 +1,35 @@
-"""Loop that every encoder needs."""
+"""What several encoders share with their loops."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillpath.models.jit import kernel
 
-__all__ = ["lay_out"]
+__all__ = ["MoveLimits", "lay_out"]
+
+Array = NDArray[np.float64]
+
+
+class MoveLimits(NamedTuple):
+    """What a firmware allows every move, without look-ahead; arrays of shape (n,).
+
+    Attributes
+    ----------
+    length_mm : ndarray
+        Of X Y Z, or of filament where these stand.
+    accel_mm_s2, speed_mm_s : ndarray
+    junction_mm_s : ndarray
+        Highest speed where the move begins.
+    """
+
+    length_mm: Array
+    accel_mm_s2: Array
+    speed_mm_s: Array
+    junction_mm_s: Array
 
 
 @kernel(allocates=False)

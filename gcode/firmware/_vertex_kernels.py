@@ -13,13 +13,26 @@ about one time only the best few are followed on.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stillpath.models.jit import kernel
 
-__all__ = ["MOST_PLACES", "choose_vertices", "hop", "list_places", "nearly_back"]
+__all__ = [
+    "MOST_PLACES",
+    "Answer",
+    "Places",
+    "Rules",
+    "choose_vertices",
+    "hop",
+    "list_places",
+    "nearly_back",
+]
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 MOST_PLACES = 13
 """Places that are tried for a vertex in a slow place; in others it is `_PLACES`."""
@@ -49,6 +62,107 @@ _FAR = 1.2
 """What a squared error is above that, in steps of X, counts too, wherever the error points."""
 
 
+class Places(NamedTuple):
+    """Places on whole steps to choose a vertex from; the first and the last vertex have one.
+
+    Attributes
+    ----------
+    place : ndarray of int64, shape (n, MOST_PLACES, 2)
+    at : ndarray, shape (n, MOST_PLACES)
+        When, in samples.
+    counts : ndarray of int64, shape (n,)
+        How many they are.
+    slow : ndarray of bool, shape (n,)
+        A vertex or one beside it is nearer to its neighbour than the least steps of a move.
+    """
+
+    place: Ints
+    at: Array
+    counts: Ints
+    slow: NDArray[np.bool_]
+
+
+class Rules(NamedTuple):
+    """What moves must be like.
+
+    Attributes
+    ----------
+    least : int
+        Steps that vertices are apart at least.
+    unit : ndarray, shape (2,)
+        How long a step of X and one of Y are, in steps of X.
+    step : ndarray, shape (2,)
+        By how much the step rates of X and Y (of a CoreXY's motors), in steps per sample, may step
+        at a vertex; more is made to cost much.
+    spare : float
+        How many steps within a segment rounding may add to that.
+    bend : ndarray, shape (3,)
+        Acceleration in steps of X per sample^2. A step of speed is a ramp, or a bend, within the
+        shorter of two segments; what does not fit is made to cost as much. Then a gentle
+        acceleration, beyond which it is to cost something, too, where a motor makes more steps per
+        sample than the third number.
+    corexy : bool
+    """
+
+    least: int
+    unit: Array
+    step: Array
+    spare: float
+    bend: Array
+    corexy: bool
+
+
+class Answer(NamedTuple):
+    """The printer's answer to an error e, for X and for Y.
+
+    It is direct e + sum of Re(weight x), x <- pole x + e.
+
+    Attributes
+    ----------
+    pole, weight : ndarray, shape (2, 2 order)
+        Real and imaginary parts take turns.
+    direct : ndarray, shape (2,)
+    energy : ndarray, shape (2, 2 order, 2 order)
+        Energy of what states answer from now on, as a quadratic form of their parts.
+    """
+
+    pole: Array
+    weight: Array
+    direct: Array
+    energy: Array
+
+
+class _Search(NamedTuple):
+    """What is known of the ways to every place.
+
+    Attributes
+    ----------
+    cost : ndarray, shape (n, MOST_PLACES)
+        Of the best way to a place, infinite to begin with.
+    rank : ndarray, shape (n, MOST_PLACES)
+        The cost and what is still to come of it, infinite to begin with.
+    came : ndarray of int64, shape (n, MOST_PLACES)
+        Vertex and place that the best way comes from, or -1.
+    states : ndarray, shape (n, MOST_PLACES, 4 order)
+        The printer's there, X's before Y's.
+    ways : ndarray of int64, shape (n, _WAYS)
+        Places that are followed on from a vertex, the best first.
+    n_ways : ndarray of int64, shape (n,)
+        How many they are, none to begin with.
+    x, kept : ndarray, shapes (4 order,) and (_WAYS,)
+        Room to work in.
+    """
+
+    cost: Array
+    rank: Array
+    came: Ints
+    states: Array
+    ways: Ints
+    n_ways: Ints
+    x: Array
+    kept: Array
+
+
 @kernel(inline=True)
 def hop(dx: Any, dy: Any, dz: Any, corexy: bool) -> Any:
     """Count the steps of the motor that makes the most of them."""
@@ -73,10 +187,7 @@ def list_places(
     corexy: bool,
     low: Any,
     high: Any,
-    slow: Any,
-    place: Any,
-    place_at: Any,
-    count: Any,
+    places: Places,
 ) -> None:
     """List for each vertex of a fit the places on whole steps to choose from, and when.
 
@@ -91,13 +202,10 @@ def list_places(
     z : ndarray of int64, shape (n,)
     low, high : ndarray of int64, shape (2,)
         Travel of X and Y.
-    slow : ndarray of bool, shape (n,)
-        Filled: a vertex or one beside it is nearer to its neighbour than `least` steps.
-    place : ndarray of int64, shape (n, MOST_PLACES, 2)
-    place_at : ndarray, shape (n, MOST_PLACES)
-    count : ndarray of int64, shape (n,)
-        Filled. The first and the last vertex have one place.
+    places : Places
+        Filled.
     """
+    place, place_at, count, slow = places
     n = len(at)
     slow[:] = False
     nearest = np.round(wanted).astype(np.int64)
@@ -166,30 +274,19 @@ def list_places(
 
 @kernel
 def choose_vertices(
-    place: Any,
-    place_at: Any,
-    count: Any,
-    slow: Any,
+    places: Places,
     z: Any,
     command: Any,
     heading: Any,
-    least: int,
-    unit: Any,
-    step: Any,
-    spare: float,
-    bend: Any,
-    corexy: bool,
-    pole: Any,
-    weight: Any,
-    direct: Any,
-    energy: Any,
+    rules: Rules,
+    answer: Answer,
     chosen: Any,
 ) -> bool:
-    """Choose the vertices of a stretch and their places, `least` steps or more apart.
+    """Choose the vertices of a stretch and their places.
 
     Parameters
     ----------
-    place, place_at, count, slow
+    places : Places
         From `list_places`.
     z : ndarray of int64, shape (n,)
     command : ndarray, shape (m, 3)
@@ -197,24 +294,8 @@ def choose_vertices(
         a step of X.
     heading : ndarray, shape (m, 2)
         The path's direction there, a unit vector.
-    unit : ndarray, shape (2,)
-        How long a step of X and one of Y are, in steps of X.
-    step : ndarray, shape (2,)
-        By how much the step rates of X and Y (of a CoreXY's motors), in steps per sample, may step
-        at a vertex; more is made to cost much.
-    spare : float
-        How many steps within a segment rounding may add to that.
-    bend : ndarray, shape (3,)
-        Acceleration in steps of X per sample^2. A step of speed is a ramp, or a bend, within the
-        shorter of two segments; what does not fit is made to cost as much. Then a gentle
-        acceleration, beyond which it is to cost something, too, where a motor makes more steps per
-        sample than the third number.
-    pole, weight : ndarray, shape (2, 2 order)
-    direct : ndarray, shape (2,)
-        The printer's answer to an error e is direct e + sum of Re(weight x), x <- pole x + e, for
-        X and for Y; real and imaginary parts take turns.
-    energy : ndarray, shape (2, 2 order, 2 order)
-        Energy of what states answer from now on, as a quadratic form of their parts.
+    rules : Rules
+    answer : Answer
     chosen : ndarray of int64, shape (n,)
         Filled: the number of the vertex' place, -1 where it is left out.
 
@@ -227,91 +308,36 @@ def choose_vertices(
     -----
     No segment goes straight back along the one before it in a slow place.
     """
-    n, width = len(place), 2 * pole.shape[1]
-    cost = np.full((n, MOST_PLACES), np.inf)
-    rank = np.full((n, MOST_PLACES), np.inf)
-    came = np.full((n, MOST_PLACES), -1, np.int64)
-    states = np.zeros((n, MOST_PLACES, width))
-    ways, n_ways = np.zeros((n, _WAYS), np.int64), np.zeros(n, np.int64)
-    x, kept = np.empty(width), np.empty(_WAYS)
-    return _follow(
-        place,
-        place_at,
-        count,
-        slow,
-        z,
-        command,
-        heading,
-        least,
-        unit,
-        step,
-        spare,
-        bend,
-        corexy,
-        pole,
-        weight,
-        direct,
-        energy,
-        cost,
-        rank,
-        came,
-        states,
-        ways,
-        n_ways,
-        x,
-        kept,
-        chosen,
+    n, width = len(places.place), 2 * answer.pole.shape[1]
+    search = _Search(
+        np.full((n, MOST_PLACES), np.inf),
+        np.full((n, MOST_PLACES), np.inf),
+        np.full((n, MOST_PLACES), -1, np.int64),
+        np.zeros((n, MOST_PLACES, width)),
+        np.zeros((n, _WAYS), np.int64),
+        np.zeros(n, np.int64),
+        np.empty(width),
+        np.empty(_WAYS),
     )
+    return _follow(places, z, command, heading, rules, answer, search, chosen)
 
 
 @kernel(allocates=False)
 def _follow(
-    place: Any,
-    place_at: Any,
-    count: Any,
-    slow: Any,
+    places: Places,
     z: Any,
     command: Any,
     heading: Any,
-    least: int,
-    unit: Any,
-    step: Any,
-    spare: float,
-    bend: Any,
-    corexy: bool,
-    pole: Any,
-    weight: Any,
-    direct: Any,
-    energy: Any,
-    cost: Any,
-    rank: Any,
-    came: Any,
-    states: Any,
-    ways: Any,
-    n_ways: Any,
-    x: Any,
-    kept: Any,
+    rules: Rules,
+    answer: Answer,
+    search: _Search,
     chosen: Any,
 ) -> bool:
-    """See `choose_vertices`; the rest is room to work in.
-
-    Parameters
-    ----------
-    cost : ndarray, shape (n, MOST_PLACES)
-        Of the best way to a place, infinite to begin with.
-    rank : ndarray, shape (n, MOST_PLACES)
-        The cost and what is still to come of it, infinite to begin with.
-    came : ndarray of int64, shape (n, MOST_PLACES)
-        Vertex and place that the best way comes from, or -1.
-    states : ndarray, shape (n, MOST_PLACES, 4 order)
-        The printer's there, X's before Y's.
-    ways : ndarray of int64, shape (n, _WAYS)
-        Places that are followed on from a vertex, the best first.
-    n_ways : ndarray of int64, shape (n,)
-        How many they are, none to begin with.
-    x : ndarray, shape (4 order,)
-    kept : ndarray, shape (_WAYS,)
-    """
+    """See `choose_vertices`."""
+    place, place_at, count, slow = places
+    least, unit, step, spare, bend, corexy = rules
+    pole, weight, direct, energy = answer
+    cost, rank, came, states, ways, n_ways, x, kept = search
     n, order = len(place), pole.shape[1] // 2
     width, gentle = 4 * order, bend[1] / bend[0]
     cost[0, 0] = rank[0, 0] = 0.0
@@ -385,17 +411,17 @@ def _follow(
                         for axis in range(2):
                             start, leg = (from_x, bx) if axis == 0 else (from_y, by)
                             error = start + leg * per * t - command[s, axis]
-                            answer = direct[axis] * error
+                            said = direct[axis] * error
                             for r in range(0, 2 * order, 2):
                                 q = 2 * order * axis + r
                                 re, im = x[q], x[q + 1]
-                                answer += weight[axis, r] * re - weight[axis, r + 1] * im
+                                said += weight[axis, r] * re - weight[axis, r + 1] * im
                                 x[q] = pole[axis, r] * re - pole[axis, r + 1] * im + error
                                 x[q + 1] = pole[axis, r] * im + pole[axis, r + 1] * re
-                            answer, error = answer * unit[axis], error * unit[axis]
-                            total += answer * answer + _SEEN * error * error
+                            said, error = said * unit[axis], error * unit[axis]
+                            total += said * said + _SEEN * error * error
                             square += error * error
-                            answer_along += heading[s, axis] * answer
+                            answer_along += heading[s, axis] * said
                             error_along += heading[s, axis] * error
                         along = answer_along * answer_along + _SEEN * error_along * error_along
                         total += max(square - _FAR, 0.0) - (1.0 - _ALONG) * along

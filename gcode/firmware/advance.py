@@ -1,8 +1,8 @@
 """Pressure advance in the filament of a stream, where the firmware's own cannot be used.
 
-A firmware that adds advance during its ramps finds none in a stream of short segments, whose ramps
-last a part of a step. There its own is switched off, and the
-stream's filament is advanced by the same amount.
+A firmware adds advance during its ramps. In a stream of short segments a ramp is shorter than a
+motor step, so nothing would be added. The firmware's own advance is therefore switched off there,
+and the filament of the stream is advanced by the same amount.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from stillpath.gcode.segments import Segments
 from stillpath.gcode.timeline import Timeline
 from stillpath.gcode.types import Phases
 
-__all__ = ["feed_at_ends", "final_segments"]
+__all__ = ["feed_at_ends"]
 
 
 def feed_at_ends(
@@ -36,11 +36,6 @@ def feed_at_ends(
     speed = _speed_at(piece.phases, rows, segments.end_s - timeline.row_start_s[rows])
     prints = piece.phases.prints[rows]
     return rows, np.where(prints, piece.phases.direction[rows, 3] * speed, 0.0), prints
-
-
-def final_segments(segments: Segments) -> NDArray[np.bool_]:
-    """Mark segments that end their stretch."""
-    return np.append(segments.group[1:] != segments.group[:-1], True)
 
 
 def _speed_at(

@@ -72,11 +72,10 @@ def intended(
         by_mm = told_mm[..., :2] - there_mm[..., :2]
         return np.where(np.all(np.abs(by_mm) <= half_step_mm, axis=-1, keepdims=True), by_mm, 0.0)
 
-    length_mm = _length_mm(phases)
+    length_mm = phases.length_mm
     moves_xy = np.any(phases.direction[:, :2] != 0.0, axis=1) & (length_mm > 0.0)
-    there_mm = phases.start_mm + phases.direction * length_mm[:, None]
     first = rounded_by(start_mm[phases.move_index[0]], phases.start_mm[0])
-    by_mm = np.vstack([first, rounded_by(end_mm[phases.move_index], there_mm)])
+    by_mm = np.vstack([first, rounded_by(end_mm[phases.move_index], phases.end_mm)])
     # The others leave X and Y where they are.
     kept = np.maximum.accumulate(np.where(moves_xy, np.arange(1, len(phases) + 1), 0))
     begins, ends = by_mm[np.append(0, kept[:-1])], by_mm[kept]
@@ -84,13 +83,6 @@ def intended(
     starts_mm[:, :2] += begins
     direction[moves_xy, :2] += ((ends - begins)[moves_xy].T / length_mm[moves_xy]).T
     return replace(phases, start_mm=starts_mm, direction=direction)
-
-
-def _length_mm(phases: Phases) -> NDArray[np.float64]:
-    """How long each move is."""
-    begin, top, end = phases.start_mm_s, phases.cruise_mm_s, phases.end_mm_s
-    ramps = (begin + top) * phases.accel_s + (top + end) * phases.decel_s
-    return np.asarray(0.5 * ramps + top * phases.cruise_s)
 
 
 def check_moves_end(phases: Phases, line: Callable[[int], int]) -> None:

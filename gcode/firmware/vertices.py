@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,13 +14,16 @@ from numpy.typing import NDArray
 from stillpath.gcode._segment_kernels import path_directions
 from stillpath.gcode.firmware._vertex_kernels import (
     MOST_PLACES,
+    Answer,
+    Places,
+    Rules,
     choose_vertices,
     list_places,
 )
 from stillpath.gcode.segments import ErrorFilter, Segments
 from stillpath.gcode.timeline import Timeline
 
-__all__ = ["Lattice", "vertices_on_steps"]
+__all__ = ["Lattice", "steps_within", "vertices_on_steps"]
 
 _FILAMENT_MM = 0.01
 """An error of the filament that counts as much as a step of X."""
@@ -65,11 +68,35 @@ class Lattice:
     fast_mm_s: float = np.inf
     fast_accel_mm_s2: float = np.inf
 
-    def bends(self, dt_s: float) -> NDArray[np.float64]:
-        """Return `bend` of `choose_vertices`."""
-        step, step2 = self.per_mm[0] * dt_s, self.per_mm[0] * dt_s**2
+    def rules(self, dt_s: float) -> Rules:
+        """Return what moves must be like, in steps and samples."""
+        scale, step, step2 = self.per_mm, self.per_mm[0] * dt_s, self.per_mm[0] * dt_s**2
         accel, gentle = self.accel_mm_s2, self.fast_accel_mm_s2
-        return np.array([accel * step2, gentle * step2, self.fast_mm_s * step])
+        return Rules(
+            least=self.least,
+            unit=scale[0] / scale[:2],
+            step=self.speed_step_mm_s * scale[:2] * dt_s,
+            spare=self.spare_steps,
+            bend=np.array([accel * step2, gentle * step2, self.fast_mm_s * step]),
+            corexy=self.corexy,
+        )
+
+
+def steps_within(
+    travel_mm: Sequence[tuple[float, float]], per_mm: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the first and the last step of X and Y within their travel.
+
+    Parameters
+    ----------
+    travel_mm : sequence of (float, float)
+        Least and largest X, and Y.
+    per_mm : ndarray, shape (2 or more,)
+    """
+    low_mm, high_mm = np.transpose(travel_mm)
+    # But for the rounding of decimals.
+    low, high = low_mm * per_mm[:2] - 1e-6, high_mm * per_mm[:2] + 1e-6
+    return np.ceil(low).astype(np.int64), np.floor(high).astype(np.int64)
 
 
 def vertices_on_steps(lattice: Lattice, timeline: Timeline, segments: Segments) -> Segments:
@@ -89,16 +116,14 @@ def vertices_on_steps(lattice: Lattice, timeline: Timeline, segments: Segments) 
         The last vertex of a stretch stays where it is. All moves have `lattice.least` steps, but
         for a stretch where there is no such choice: its vertices are rounded.
     """
-    answers = _Answers.of(segments.error_filter)
+    answer = _answer_of(segments.error_filter)
     direction = np.empty((2, timeline.position_mm.shape[1]))
     path_directions(timeline.position_mm[:2], direction)
-    firsts = np.flatnonzero(np.append(True, segments.group[1:] != segments.group[:-1]))
     end_s, end_mm, groups = [], [], []
-    for first, stop in itertools.pairwise((*firsts.tolist(), len(segments))):
-        group = int(segments.group[first])
-        at_s = np.append(timeline.start_s[group], segments.end_s[first:stop])
-        at_mm = np.vstack([timeline.group_start_mm[group], segments.end_mm[:, first:stop].T])
-        at_s, at_mm = _chosen(lattice, timeline.dt_s, at_s, at_mm, answers, direction)
+    for group, rows in segments.stretches():
+        at_s = np.append(timeline.start_s[group], segments.end_s[rows])
+        at_mm = np.vstack([timeline.group_start_mm[group], segments.end_mm[:, rows].T])
+        at_s, at_mm = _chosen(lattice, timeline.dt_s, at_s, at_mm, answer, direction)
         end_s.append(at_s[1:])
         end_mm.append(at_mm[1:])
         groups.append(np.full(len(at_s) - 1, group, np.int64))
@@ -110,30 +135,21 @@ def vertices_on_steps(lattice: Lattice, timeline: Timeline, segments: Segments) 
     )
 
 
-@dataclass(frozen=True, slots=True)
-class _Answers:
-    """An `ErrorFilter` in real numbers, as `choose_vertices` takes it."""
-
-    pole: NDArray[np.float64]
-    weight: NDArray[np.float64]
-    direct: NDArray[np.float64]
-    energy: NDArray[np.float64]
-
-    @classmethod
-    def of(cls, answer: ErrorFilter | None) -> _Answers:
-        pole, weight, direct = np.zeros((2, 1), complex), np.zeros((2, 1), complex), np.ones(2)
-        if answer is not None:
-            pole, weight, direct = answer.pole, answer.weight, answer.direct
-        # The sum over k of Re(w_a p_a^k x_a) Re(w_b p_b^k x_b) is half of
-        # Re(x_a (plain_ab x_b + crossed_ab conj x_b)), with x = 1 and x = i for the two parts.
-        energy = []
-        for p, w in zip(pole, weight, strict=True):
-            plain = 0.5 * np.outer(w, w) / (1.0 - np.outer(p, p))
-            crossed = 0.5 * np.outer(w, w.conj()) / (1.0 - np.outer(p, p.conj()))
-            unit = np.kron(np.eye(len(p)), [1.0, 1j])
-            form = (unit.T @ (plain @ unit + crossed @ unit.conj())).real
-            energy.append(0.5 * (form + form.T))
-        return cls(_parts(pole), _parts(weight), np.asarray(direct), np.stack(energy))
+def _answer_of(errors: ErrorFilter | None) -> Answer:
+    """Return an `ErrorFilter` in real numbers."""
+    pole, weight, direct = np.zeros((2, 1), complex), np.zeros((2, 1), complex), np.ones(2)
+    if errors is not None:
+        pole, weight, direct = errors.pole, errors.weight, errors.direct
+    # The sum over k of Re(w_a p_a^k x_a) Re(w_b p_b^k x_b) is half of
+    # Re(x_a (plain_ab x_b + crossed_ab conj x_b)), with x = 1 and x = i for the two parts.
+    energy = []
+    for p, w in zip(pole, weight, strict=True):
+        plain = 0.5 * np.outer(w, w) / (1.0 - np.outer(p, p))
+        crossed = 0.5 * np.outer(w, w.conj()) / (1.0 - np.outer(p, p.conj()))
+        unit = np.kron(np.eye(len(p)), [1.0, 1j])
+        form = (unit.T @ (plain @ unit + crossed @ unit.conj())).real
+        energy.append(0.5 * (form + form.T))
+    return Answer(_parts(pole), _parts(weight), np.asarray(direct), np.stack(energy))
 
 
 def _parts(values: NDArray[np.complex128]) -> NDArray[np.float64]:
@@ -200,15 +216,19 @@ def _chosen(
     dt_s: float,
     at_s: NDArray[np.float64],
     at_mm: NDArray[np.float64],
-    answers: _Answers,
+    answer: Answer,
     direction: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Vertices of one stretch and its start, times (n,) and places (n, 4)."""
     at_s, at_mm = _often(lattice, at_s, at_mm)
     near, scale, n = _Stretch.of(lattice.per_mm, dt_s, at_s, at_mm), lattice.per_mm, len(at_s)
     heading = direction[:, np.minimum(near.samples, direction.shape[1] - 1)].T.copy()
-    slow, count = np.zeros(n, np.bool_), np.zeros(n, np.int64)
-    place, place_at = np.zeros((n, MOST_PLACES, 2), np.int64), np.zeros((n, MOST_PLACES))
+    places = Places(
+        place=np.zeros((n, MOST_PLACES, 2), np.int64),
+        at=np.zeros((n, MOST_PLACES)),
+        counts=np.zeros(n, np.int64),
+        slow=np.zeros(n, np.bool_),
+    )
     list_places(
         near.at,
         near.steps[:, :2].copy(),
@@ -218,39 +238,18 @@ def _chosen(
         lattice.corexy,
         lattice.low - near.origin,
         lattice.high - near.origin,
-        slow,
-        place,
-        place_at,
-        count,
+        places,
     )
     chosen = np.zeros(n, np.int64)
-    if not choose_vertices(
-        place,
-        place_at,
-        count,
-        slow,
-        near.z,
-        near.command,
-        heading,
-        lattice.least,
-        scale[0] / scale[:2],
-        lattice.speed_step_mm_s * scale[:2] * dt_s,
-        lattice.spare_steps,
-        lattice.bends(dt_s),
-        lattice.corexy,
-        answers.pole,
-        answers.weight,
-        answers.direct,
-        answers.energy,
-        chosen,
-    ):
+    rules = lattice.rules(dt_s)
+    if not choose_vertices(places, near.z, near.command, heading, rules, answer, chosen):
         at_mm[1:-1, :2] = np.round(at_mm[1:-1, :2] * scale[:2]) / scale[:2]
         return at_s, at_mm
     keep = np.flatnonzero(chosen >= 0)
     which = chosen[keep]
-    at_kept = place_at[keep, which]
+    at_kept = places.at[keep, which]
     kept_mm = np.column_stack([np.interp(at_kept, near.at, row) for row in at_mm.T])
-    kept_mm[:, :2] = (place[keep, which] + near.origin) / scale[:2]
+    kept_mm[:, :2] = (places.place[keep, which] + near.origin) / scale[:2]
     kept_mm[[0, -1]] = at_mm[[0, -1]]
     kept_s = (at_kept + near.first) * dt_s
     kept_s[[0, -1]] = at_s[[0, -1]]

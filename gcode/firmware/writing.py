@@ -36,6 +36,7 @@ FILE_SETS_SHAPER = "The file sets the firmware's input shaper"
 """How the warning begins."""
 
 _BYTES_PER_LINE = 96
+_LEVEL, _EVENT, _REST = range(3)
 _SHAPED = (EventKind.UNKNOWN, EventKind.SHAPER)
 _LEAST_GAP_MM = 1e-7
 _FAR_MM = 10.0
@@ -178,9 +179,11 @@ class StreamWriter:
 
         kinds = events.kind.tolist()
         rest_rows = np.flatnonzero(rows >= 0)
-        order: list[tuple[int, int, int]] = [(int(i), 0, k) for k, i in enumerate(index)]
-        order += [(int(i), 1, int(rows[i])) for i in rest_rows]
-        order += [(int(i), -1, 0) for i in 1 + np.flatnonzero(np.diff(level))]  # other limits
+        # What stands before the text of written move `at`: other limits first, then the file's
+        # events, then a rest's own line.
+        order = [(int(i), _LEVEL, 0) for i in 1 + np.flatnonzero(np.diff(level))]
+        order += [(int(i), _EVENT, k) for k, i in enumerate(index)]
+        order += [(int(i), _REST, int(rows[i])) for i in rest_rows]
         done = 0
         last_line = -1
         for at, kind, what in sorted(order):
@@ -189,9 +192,9 @@ class StreamWriter:
                 parts += [self._ours(limits[level[at - 1]], modes.at(at - 1)), text[done:upto]]
                 done = upto
             written = float(extruded[at - 1] if at else piece.moves.start_mm[0, 3])
-            if kind == 0:
+            if kind == _EVENT:
                 parts.append(self._event(piece, what, kinds[what], written))
-            elif kind > 0 and int(piece.moves.line[what]) != last_line:
+            elif kind == _REST and int(piece.moves.line[what]) != last_line:
                 last_line = int(piece.moves.line[what])
                 parts.append(self._rest_line(piece, what, written))
         if len(text) > done:

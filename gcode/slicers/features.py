@@ -7,9 +7,10 @@ Kiri:Moto.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import Enum
 
-__all__ = ["Feature", "feature_of", "feature_title"]
+__all__ = ["Feature", "feature_name", "feature_of", "feature_title"]
 
 
 class Feature(Enum):
@@ -115,6 +116,11 @@ _FEATURES = {name: feature for feature, names in _NAMES.items() for name in name
 def feature_of(name: str) -> Feature | None:
     """Return which feature a slicer's name means, or None where it is not known."""
     return _FEATURES.get(name.strip().lower())
+
+
+def feature_name(number: int, names: Sequence[str]) -> str:
+    """Return the slicer's name of a feature by its number, which is -1 where it is not known."""
+    return names[number] if number >= 0 else "unnamed"
 
 
 def feature_title(name: str) -> str:

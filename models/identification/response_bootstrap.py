@@ -137,23 +137,20 @@ def _within(response: FrequencyResponse, fit: Fit) -> FrequencyResponse:
     used = coherent(response.coherence) & (f >= low_high[0]) & (f <= low_high[1])
     used &= np.isfinite(response.response) & (np.abs(response.response) > 0)
     order = np.flatnonzero(used)[np.argsort(f[used], kind="stable")]
-    return replace(
-        response,
-        f_hz=f[order],
-        response=response.response[order],
-        sd=response.sd[order],
-        coherence=np.full(len(order), np.nan),
-    )
+    return replace(_rows(response, order), coherence=np.full(len(order), np.nan))
 
 
 def _thinned(response: FrequencyResponse) -> FrequencyResponse:
-    some = slice(None, None, max(1, len(response.f_hz) // _POINTS))
+    return _rows(response, slice(None, None, max(1, len(response.f_hz) // _POINTS)))
+
+
+def _rows(response: FrequencyResponse, rows: slice | NDArray[np.int64]) -> FrequencyResponse:
     return replace(
         response,
-        f_hz=response.f_hz[some],
-        response=response.response[some],
-        sd=response.sd[some],
-        coherence=response.coherence[some],
+        f_hz=response.f_hz[rows],
+        response=response.response[rows],
+        sd=response.sd[rows],
+        coherence=response.coherence[rows],
     )
 
 

@@ -20,7 +20,7 @@ from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.pacing import FirstLayer
 from stillpath.gcode.slicers.facts import SlicerFacts
-from stillpath.gcode.slicers.features import feature_title
+from stillpath.gcode.slicers.features import feature_name, feature_title
 from stillpath.gcode.types import ProgramBlock
 from stillpath.models.machine import Machine
 from stillpath.models.schedule import OperatingPoint
@@ -40,7 +40,7 @@ from stillpath.pipeline.file_rewriting import file_rewriting
 from stillpath.pipeline.files import default_cache_dir
 from stillpath.pipeline.measuring.earlier import EarlierErrors
 from stillpath.pipeline.measuring.layer_files import LayerWriter
-from stillpath.pipeline.measuring.measure import STRIDE, Measurement, channel_names
+from stillpath.pipeline.measuring.measure import CHANNELS, STRIDE, UNCHANGED_CHANNELS, Measurement
 from stillpath.pipeline.measuring.points import MotionSamples
 from stillpath.pipeline.measuring.reference_shaper import cached_shaper
 from stillpath.pipeline.measuring.set_errors import ClassError, SetErrors
@@ -145,9 +145,7 @@ class _Job:
         self, name: str, facts: SlicerFacts, earlier: EarlierErrors, layers: LayerWriter | None
     ) -> Result:
         measuring: dict[str, Any] = {"earlier": earlier, "size": self._source.seek(0, io.SEEK_END)}
-        original = Measurement(
-            self._machine, DT_S, self._shaper, channel_names(compensated=False), **measuring
-        )
+        original = Measurement(self._machine, DT_S, self._shaper, UNCHANGED_CHANNELS, **measuring)
         before = SetErrors(self._machine, DT_S, stride=STRIDE)
         reading = FirstReading(self._machine, self._adviser)
         with self._clock.stage("measure the original"):
@@ -208,7 +206,7 @@ class _Job:
         """Return warnings: stored settings, unknown shapers, features with too large errors."""
         unshaped = "" if self._shapes(reading) else None
         given_back = self._before.label if figures.shapers else unshaped
-        helpless = [names[f] if f >= 0 else "unnamed" for f in sorted(choice.helpless)]
+        helpless = [feature_name(f, names) for f in sorted(choice.helpless)]
         return [
             *stored_settings(reading.stored_lines, shaper=given_back),
             *shaper_warnings(
@@ -320,7 +318,7 @@ class _Job:
                 continue
             bound = bounds.get(f)
             limit = self._bound_um(f, was) if f in choice.rung else None
-            name = names[f] if f >= 0 else "unnamed"
+            name = feature_name(f, names)
             features.append(
                 AdvisedFeature(
                     name=name,
@@ -431,7 +429,7 @@ def _merged(before: Sequence[GroupFigures], after: Sequence[GroupFigures]) -> li
 
 
 def _in_order(values: dict[str, V]) -> dict[str, V]:
-    return {n: values[n] for n in channel_names(compensated=True) if n in values}
+    return {n: values[n] for n in CHANNELS if n in values}
 
 
 def _merged_spectra(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,10 @@ __all__ = [
     "SAMPLES",
     "SPARE",
     "UNKNOWN",
+    "Columns",
+    "Points",
+    "Samples",
+    "State",
     "follow",
 ]
 
@@ -48,67 +53,97 @@ _SAGITTA_MM, _TURN = 0.02, 0.35
 _SAME_HEIGHT_MM = 0.04
 
 
+class Samples(NamedTuple):
+    """Measured motion: places, heights, what extrudes, rows of the moves, errors by channel."""
+
+    xy: Array
+    z: Array
+    extruding: NDArray[np.bool_]
+    row: Ints
+    error: Array
+
+
+class Columns(NamedTuple):
+    """Columns of `gcode.types.Moves`."""
+
+    start: Array
+    end: Array
+    line: Ints
+    byte_start: Ints
+    byte_end: Ints
+    layer: NDArray[np.int32]
+    feature: NDArray[np.int32]
+
+
+class State(NamedTuple):
+    """How far `follow` has come.
+
+    Attributes
+    ----------
+    place, number : ndarray
+        See above.
+    high, low, recent : ndarray, shape (channels,)
+        Largest and smallest error since the last point, and the last one.
+    tally : ndarray, shape (2 channels + 1,)
+        Sums of squares, largest values and number of the samples that extrude.
+    """
+
+    place: Array
+    number: Ints
+    high: Array
+    low: Array
+    recent: Array
+    tally: Array
+
+
+class Points(NamedTuple):
+    """Points of a tile, and room for more."""
+
+    xyz: NDArray[np.float32]
+    line: NDArray[np.uint32]
+    error: NDArray[np.uint16]
+    feature: NDArray[np.int32]
+    on: NDArray[np.uint8]
+
+
 @kernel(allocates=False)
 def follow(
-    xy: Array,
-    z: Array,
-    extruding: NDArray[np.bool_],
-    row: Ints,
-    error: Array,
+    samples: Samples,
     begin: int,
+    moves: Columns,
     first: int,
     until: int,
-    start: Array,
-    end: Array,
-    line: Ints,
-    byte_start: Ints,
-    byte_end: Ints,
-    layer: NDArray[np.int32],
-    feature: NDArray[np.int32],
     point_bytes: float,
-    place: Array,
-    number: Ints,
-    high: Array,
-    low: Array,
-    recent: Array,
-    tally: Array,
-    out_xyz: NDArray[np.float32],
-    out_line: NDArray[np.uint32],
-    out_error: NDArray[np.uint16],
-    out_feature: NDArray[np.int32],
-    out_on: NDArray[np.uint8],
+    state: State,
+    points: Points,
 ) -> int:
     """Add the points of samples to a tile, until it is full or another one begins.
 
     Parameters
     ----------
-    xy, z, extruding, row, error
-        Samples, shapes (2, n), (n,), (n,), (n,), (channels, n); `row` counts in the moves.
+    samples : Samples
+        `row` counts in the moves.
     begin : int
         First sample to look at.
+    moves : Columns
     first, until : int
         Number in the file of the first of the moves; moves before `until` end after the samples.
-    start, end, line, byte_start, byte_end, layer, feature
-        Columns of the moves.
     point_bytes : float
         What a point costs.
-    place, number : ndarray
-        State, see above.
-    high, low, recent : ndarray, shape (channels,)
-        Largest and smallest error since the last point, and the last one.
-    tally : ndarray, shape (2 channels + 1,)
-        Sums of squares, largest values and number of the samples that extrude.
-    out_*
-        Points of the tile.
+    state : State
+    points : Points
 
     Returns
     -------
     int
         The sample to go on with; -1 when all is done.
     """
-    channels, samples, room = error.shape[0], error.shape[1], out_line.shape[0]
-    for i in range(begin, samples + 1):
-        last = i == samples
+    xy, z, extruding, row, error = samples
+    start, end, line, byte_start, byte_end, layer, _ = moves
+    place, number, high, low, recent, tally = state
+    channels, count, room = error.shape[0], error.shape[1], points.line.shape[0]
+    for i in range(begin, count + 1):
+        last = i == count
         target = until if last else first + row[i]
         while number[MOVE] < target:
             k = number[MOVE] - first
@@ -131,11 +166,8 @@ def follow(
                     if number[SAMPLES] == 0:
                         for c in range(channels):
                             high[c] = recent[c] if last else max(recent[c], error[c, i])
-                    _add(
-                        end[k, 0], end[k, 1], end[k, 2], k, end[k, 3] > start[k, 3], line,
-                        feature, place, number, high, out_xyz, out_line, out_error, out_feature,
-                        out_on,
-                    )  # fmt: skip
+                    on = end[k, 3] > start[k, 3]
+                    _add(end[k, 0], end[k, 1], end[k, 2], k, on, moves, state, points)
             number[MOVE] += 1
         if last:
             break
@@ -163,11 +195,8 @@ def follow(
                     if top - least > max(_CHANGE_MM, _CHANGE_SHARE * top):
                         another = True
                 if another:
-                    _add(
-                        place[PREVIOUS_X], place[PREVIOUS_Y], z[i], k, True, line,
-                        feature, place, number, high, out_xyz, out_line, out_error, out_feature,
-                        out_on,
-                    )  # fmt: skip
+                    x, y = place[PREVIOUS_X], place[PREVIOUS_Y]
+                    _add(x, y, z[i], k, True, moves, state, points)
         for c in range(channels):
             value = error[c, i]
             high[c] = max(high[c], value) if number[SAMPLES] else value
@@ -180,30 +209,17 @@ def follow(
 
 @kernel(inline=True, allocates=False)
 def _add(
-    x: float,
-    y: float,
-    z: float,
-    k: int,
-    on: bool,
-    line: Ints,
-    feature: NDArray[np.int32],
-    place: Array,
-    number: Ints,
-    high: Array,
-    out_xyz: NDArray[np.float32],
-    out_line: NDArray[np.uint32],
-    out_error: NDArray[np.uint16],
-    out_feature: NDArray[np.int32],
-    out_on: NDArray[np.uint8],
+    x: float, y: float, z: float, k: int, on: bool, moves: Columns, state: State, points: Points
 ) -> None:
     """End a stretch at x y."""
+    place, number, high = state.place, state.number, state.high
     at = number[COUNT]
-    out_xyz[0, at], out_xyz[1, at], out_xyz[2, at] = x, y, z
-    out_line[at] = line[k]
+    points.xyz[0, at], points.xyz[1, at], points.xyz[2, at] = x, y, z
+    points.line[at] = moves.line[k]
     for c in range(len(high)):
-        out_error[c, at] = min(int(high[c] * _UNITS_PER_MM + 0.5), _MOST)
-    out_feature[at] = feature[k]
-    out_on[at] = 1 if on else 0
+        points.error[c, at] = min(int(high[c] * _UNITS_PER_MM + 0.5), _MOST)
+    points.feature[at] = moves.feature[k]
+    points.on[at] = 1 if on else 0
     number[COUNT] = at + 1
     number[SAMPLES] = 0
     place[SPARE] -= 1.0

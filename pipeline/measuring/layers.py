@@ -20,7 +20,6 @@ from stillpath.pipeline.measuring import _layer_kernels as kernels
 __all__ = ["ERROR_UM", "TILE_POINTS", "UNKNOWN", "LayerRecorder", "LayerTile", "point_bytes"]
 
 Array = NDArray[np.float64]
-_Samples = tuple[Array, Array, NDArray[np.bool_], NDArray[np.int64], Array]
 
 TILE_POINTS = 1 << 17
 """A layer with more points is several tiles."""
@@ -96,7 +95,7 @@ class LayerRecorder:
     ) -> None:
         self._sample_s, self._takers = sample_s, takers
         self._point_bytes = float(point_bytes(channels))
-        self._nothing: _Samples = (
+        self._nothing = kernels.Samples(
             np.zeros((2, 0)),
             np.zeros(0),
             np.zeros(0, dtype=bool),
@@ -106,18 +105,25 @@ class LayerRecorder:
         self._moves: Moves | None = None
         self._layer = -1
         self._first = 0
-        self._place = np.zeros(kernels.HEIGHT + 1)
+        self._state = kernels.State(
+            place=np.zeros(kernels.HEIGHT + 1),
+            number=np.zeros(kernels.LINE + 1, dtype=np.int64),
+            high=np.zeros(channels),
+            low=np.zeros(channels),
+            recent=np.zeros(channels),
+            tally=np.zeros(2 * channels + 1),
+        )
+        self._place, self._number = self._state.place, self._state.number
         self._place[kernels.HEIGHT] = np.nan
-        self._number = np.zeros(kernels.LINE + 1, dtype=np.int64)
-        self._number[kernels.LINE] = -1
         self._place[kernels.SPARE] = _GRANTED
-        self._high, self._low, self._recent = (np.zeros(channels) for _ in range(3))
-        self._tally = np.zeros(2 * channels + 1)
-        self._xyz = np.empty((3, TILE_POINTS), dtype=np.float32)
-        self._line = np.empty(TILE_POINTS, dtype=np.uint32)
-        self._error = np.empty((channels, TILE_POINTS), dtype=np.uint16)
-        self._feature = np.empty(TILE_POINTS, dtype=np.int32)
-        self._on = np.empty(TILE_POINTS, dtype=np.uint8)
+        self._number[kernels.LINE] = -1
+        self._points = kernels.Points(
+            xyz=np.empty((3, TILE_POINTS), dtype=np.float32),
+            line=np.empty(TILE_POINTS, dtype=np.uint32),
+            error=np.empty((channels, TILE_POINTS), dtype=np.uint16),
+            feature=np.empty(TILE_POINTS, dtype=np.int32),
+            on=np.empty(TILE_POINTS, dtype=np.uint8),
+        )
 
     def add(
         self,
@@ -148,7 +154,8 @@ class LayerRecorder:
         """
         if len(row) == 0:
             return
-        samples = (xy_mm, z_mm, extruding, row, error_mm)
+        xy_mm, error_mm = np.ascontiguousarray(xy_mm), np.ascontiguousarray(error_mm)
+        samples = kernels.Samples(xy_mm, z_mm, extruding, row, error_mm)
         here, begins = first_move + int(row[0]), self._moves is None
         if not begins and self._moves is not moves:
             # Moves that were too short for a sample end the moves before.
@@ -167,59 +174,40 @@ class LayerRecorder:
             self._add_points(self._nothing, self._first + len(self._moves))
             self._close()
 
-    def _add_points(self, samples: _Samples, until: int) -> None:
+    def _add_points(self, samples: kernels.Samples, until: int) -> None:
         """Add the points of samples and of the moves before `until`."""
         moves = self._moves
         assert moves is not None
-        xy_mm, z_mm, extruding, row, error_mm = samples
-        at = 0
+        columns = kernels.Columns(
+            moves.start_mm,
+            moves.end_mm,
+            moves.line,
+            moves.byte_start,
+            moves.byte_end,
+            moves.layer,
+            moves.feature,
+        )
+        until = min(until, self._first + len(moves))
+        given = columns, self._first, until, self._point_bytes, self._state, self._points
+        at = kernels.follow(samples, 0, *given)
         while at >= 0:
-            at = kernels.follow(
-                np.ascontiguousarray(xy_mm),
-                z_mm,
-                extruding,
-                row,
-                np.ascontiguousarray(error_mm),
-                at,
-                self._first,
-                min(until, self._first + len(moves)),
-                moves.start_mm,
-                moves.end_mm,
-                moves.line,
-                moves.byte_start,
-                moves.byte_end,
-                moves.layer,
-                moves.feature,
-                self._point_bytes,
-                self._place,
-                self._number,
-                self._high,
-                self._low,
-                self._recent,
-                self._tally,
-                self._xyz,
-                self._line,
-                self._error,
-                self._feature,
-                self._on,
-            )
-            if at >= 0:
-                self._close()
-                self._begin()
+            self._close()
+            self._begin()
+            at = kernels.follow(samples, at, *given)
 
-    def _lift(self, samples: _Samples) -> None:
+    def _lift(self, samples: kernels.Samples) -> None:
         """Jump to where samples begin, as the way there is unknown."""
         assert self._moves is not None
-        xy_mm, z_mm, _, row, _ = samples
-        self._place[[kernels.PEN_X, kernels.PEN_Y]] = xy_mm[:, 0]
+        row = int(samples.row[0])
+        self._place[[kernels.PEN_X, kernels.PEN_Y]] = samples.xy[:, 0]
         self._place[kernels.BEND] = 0.0
         self._number[kernels.SAMPLES] = 0
         if self._number[kernels.COUNT] + 2 > TILE_POINTS:
             self._close()
         if self._number[kernels.COUNT] == 0:
-            self._number[kernels.LAYER] = self._moves.layer[row[0]]
+            self._number[kernels.LAYER] = self._moves.layer[row]
             self._layer = int(self._number[kernels.LAYER])
-        self._start(float(z_mm[0]), int(self._moves.line[row[0]]))
+        self._start(float(samples.z[0]), int(self._moves.line[row]))
 
     def _begin(self) -> None:
         """Begin the tile that the kernel asks for, where the path has come to."""
@@ -229,30 +217,30 @@ class LayerRecorder:
     def _start(self, z_mm: float, line: int) -> None:
         """Add a point where a path begins."""
         at = int(self._number[kernels.COUNT])
-        self._xyz[:, at] = (*self._place[[kernels.PEN_X, kernels.PEN_Y]], z_mm)
-        self._line[at] = max(line, 0)
-        self._error[:, at] = UNKNOWN
-        self._feature[at], self._on[at] = -1, 0
+        points = self._points
+        points.xyz[:, at] = (*self._place[[kernels.PEN_X, kernels.PEN_Y]], z_mm)
+        points.line[at] = max(line, 0)
+        points.error[:, at] = UNKNOWN
+        points.feature[at], points.on[at] = -1, 0
         self._number[kernels.COUNT] = at + 1
 
     def _close(self) -> None:
         """Give the tile away, unless it is one point, and clear it."""
         count = int(self._number[kernels.COUNT])
+        points, tally = self._points, self._state.tally
         if count > 1:
-            on = self._on[:count] > 0
-            z = self._xyz[2, :count][on] if on.any() else self._xyz[2, 1:count]
-            channels = len(self._high)
-            squares, largest = self._tally[:channels], self._tally[channels:-1]
-            seen = float(self._tally[-1])
+            on = points.on[:count] > 0
+            z = points.xyz[2, :count][on] if on.any() else points.xyz[2, 1:count]
+            squares, largest, seen = *np.split(tally[:-1], 2), float(tally[-1])
             tile = LayerTile(
                 layer=self._layer,
                 z_mm=round(_median(z), 4),
-                x_mm=self._xyz[0, :count].copy(),
-                y_mm=self._xyz[1, :count].copy(),
-                line=self._line[:count].copy(),
-                error=self._error[:, :count].copy(),
-                feature=self._feature[:count].copy(),
-                on=self._on[:count].copy(),
+                x_mm=points.xyz[0, :count].copy(),
+                y_mm=points.xyz[1, :count].copy(),
+                line=points.line[:count].copy(),
+                error=points.error[:, :count].copy(),
+                feature=points.feature[:count].copy(),
+                on=points.on[:count].copy(),
                 rms_um=1e3 * np.sqrt(squares / max(seen, 1.0)),
                 max_um=1e3 * largest,
                 seconds=seen * self._sample_s,
@@ -261,7 +249,7 @@ class LayerRecorder:
                 take(tile)
         self._number[kernels.COUNT] = 0
         self._place[kernels.HEIGHT] = np.nan
-        self._tally[:] = 0.0
+        tally[:] = 0.0
 
 
 def _median(z_mm: NDArray[np.float32]) -> float:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stillpath.gcode.slicers.features import feature_title
+from stillpath.gcode.slicers.features import feature_name, feature_title
 from stillpath.models.machine import Machine
 from stillpath.models.schedule import OperatingPoint
 from stillpath.pipeline.band import BandContent
@@ -37,10 +37,14 @@ from stillpath.pipeline.result import (
 )
 from stillpath.simulation.measures import ContourErrors, GroupTally, MotionMeter, Tally
 
-__all__ = ["STRIDE", "Measurement", "channel_names"]
+__all__ = ["CHANNELS", "STRIDE", "UNCHANGED_CHANNELS", "Measurement"]
 
 Array = NDArray[np.float64]
 
+CHANNELS = ("before", "after", "shaper")
+"""The measured channels, in the order of all tables."""
+UNCHANGED_CHANNELS = ("before", "shaper")
+"""Those of a file that is not compensated."""
 STRIDE = 6
 """Contour errors are measured at every sixth sample, since they change over tens of samples; maxima
 of the written motion are searched between them, too (`maxima`)."""
@@ -59,13 +63,13 @@ class Measurement:
     shaper : BestShaper
         The reference shaper.
     names : tuple of str
-        Channels, of those that `channel_names` has. Without `after`, `before` is the executed
-        motion: the firmware's own shaper may be in it.
+        Which of `CHANNELS`. Without `after`, `before` is the executed motion: the firmware's own
+        shaper may be in it.
     earlier : EarlierErrors, optional
         Keeps the errors of `before` and `shaper` where they are measured; where `after` is, gives
         them back for what is shown along the path.
     take_layer : callable, optional
-        Is given every layer as soon as it is measured; channels as `channel_names` has them.
+        Is given every layer as soon as it is measured.
     trace : callable, optional
         Is given the motion. Errors are then measured at every sample.
     size : int, optional
@@ -77,7 +81,7 @@ class Measurement:
         machine: Machine,
         dt_s: float,
         shaper: BestShaper,
-        names: tuple[str, ...],
+        names: tuple[str, ...] = CHANNELS,
         *,
         take_layer: Callable[[LayerTile], None] | None = None,
         trace: Callable[[Trace], None] | None = None,
@@ -93,8 +97,7 @@ class Measurement:
         self._dt_s = dt_s
         self._band = BandContent(machine, dt_s)
         self._names = names
-        shown = channel_names(compensated=True) if self._beside else names
-        self._shown = shown
+        self._shown = shown = CHANNELS if self._beside else names
         self._meter = MotionMeter(dt_s, stride=self._stride, channels=len(names))
         self._layers, self._features = (GroupTally(len(names)) for _ in range(2))
         exact = names.index("after") if self._stride > 1 and compensated else None
@@ -238,26 +241,33 @@ class Measurement:
 
     def layers(self) -> list[GroupFigures]:
         """Return the figures by layer."""
-        return self._groups(self._layers, self._maxima.layers, None)
+        return self._groups(self._layers, self._maxima.layers, _layer_label)
 
     def features(self, names: Sequence[str]) -> list[GroupFigures]:
         """Return the figures by feature."""
-        return self._groups(self._features, self._maxima.features, names)
+
+        def label(number: int) -> tuple[str, str]:
+            name = feature_name(number, names)
+            return name, feature_title(name)
+
+        return self._groups(self._features, self._maxima.features, label)
 
     def _groups(
-        self, groups: GroupTally, ends_mm: dict[int, Array], names: Sequence[str] | None
+        self,
+        groups: GroupTally,
+        ends_mm: dict[int, Array],
+        label: Callable[[int], tuple[str, str]],
     ) -> list[GroupFigures]:
+        """Return the figures of groups; `label` gives the name and the title of a number."""
         tallies = {name: groups.tallies(c) for c, name in enumerate(self._names)}
         out = []
         for key, tally in tallies[self._names[0]].items():
-            label = f"{key}" if names is None else (names[key] if key >= 0 else "unnamed")
-            if names is None and key < 0:
-                label = "before the first layer"
+            name, title = label(key)
             behind_mm = ends_mm.get(key, np.zeros(len(tallies)))
             out.append(
                 GroupFigures(
-                    name=label,
-                    title=label if names is None else feature_title(label),
+                    name=name,
+                    title=title,
                     seconds=round(self._stride * tally.count * self._dt_s, 3),
                     contour_rms_um={n: 1e3 * t[key].rms for n, t in tallies.items() if key in t},
                     contour_max_um={
@@ -295,9 +305,9 @@ class Measurement:
         }
 
 
-def channel_names(*, compensated: bool) -> tuple[str, ...]:
-    """Return the names of the measured channels, in the order of all tables."""
-    return ("before", "after", "shaper") if compensated else ("before", "shaper")
+def _layer_label(number: int) -> tuple[str, str]:
+    label = f"{number}" if number >= 0 else "before the first layer"
+    return label, label
 
 
 class _Bins:

@@ -25,7 +25,7 @@ from stillpath.gcode.pacing import (
     top_limits,
 )
 from stillpath.gcode.pieces import Piece
-from stillpath.gcode.slicers.features import feature_title
+from stillpath.gcode.slicers.features import feature_name, feature_title
 from stillpath.gcode.types import Moves
 from stillpath.models.machine import Machine
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
@@ -298,4 +298,4 @@ def _name(one: int, names: Sequence[str]) -> str:
         return "travel"
     if one == AS_SLICED:
         return "all that stays as sliced"
-    return names[one] if one >= 0 else "unnamed"
+    return feature_name(one, names)

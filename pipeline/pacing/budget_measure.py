@@ -15,7 +15,7 @@ from stillpath.gcode.pacing import AS_SLICED
 from stillpath.models.machine import Machine
 from stillpath.models.schedule import OperatingPoint
 from stillpath.pipeline.measuring.layers import LayerTile
-from stillpath.pipeline.measuring.measure import Measurement, channel_names
+from stillpath.pipeline.measuring.measure import UNCHANGED_CHANNELS, Measurement
 from stillpath.pipeline.measuring.points import MotionSamples
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.pipeline.measuring.set_errors import ErrorSum, SetErrors
@@ -51,17 +51,8 @@ class BudgetMeasurement(Measurement):
         trace: Callable[[Trace], None] | None = None,
         size: int | None = None,
     ) -> None:
-        super().__init__(
-            machine,
-            dt_s,
-            shaper,
-            channel_names(compensated=True),
-            take_layer=take_layer,
-            trace=trace,
-            size=size,
-        )
-        sliced = channel_names(compensated=False)
-        self._sliced = Measurement(machine, dt_s, shaper, sliced, size=size)
+        super().__init__(machine, dt_s, shaper, take_layer=take_layer, trace=trace, size=size)
+        self._sliced = Measurement(machine, dt_s, shaper, UNCHANGED_CHANNELS, size=size)
         self._set = SetErrors(machine, dt_s, stride=_STRIDE)
 
     def operate_at(self, point: OperatingPoint) -> None:

@@ -36,6 +36,7 @@ __all__ = [
     "WAITING",
     "ComputeRequest",
     "StillRunning",
+    "prefers_page",
     "read_result",
     "run_and_wait",
     "still_running",
@@ -44,6 +45,7 @@ __all__ = [
 _LONGEST_WAIT_S = 50.0
 """What proxies wait for an answer is a minute, as a rule."""
 _LARGEST_ANSWER_BYTES = 64 << 20
+_ANSWERS = ("text/html", "application/json", "*/*")
 _WAIT = re.compile(r"(?:^|[,;\s])wait=(\d{1,6})(?:$|[,;\s])")
 _UNKNOWN = problem(500, "Job failed", "Its reason is unknown.")
 _T = TypeVar("_T")
@@ -164,6 +166,12 @@ async def run_and_wait(request: Request, caller: Caller, asked: ComputeRequest) 
             raise Problem(409, "Job cancelled", "The job was cancelled; ask again.")
         case _:
             raise StillRunning(job)
+
+
+def prefers_page(accept: str) -> bool:
+    """Return whether the header `Accept` names a page before JSON."""
+    kinds = [part.split(";")[0].strip() for part in accept.split(",")]
+    return next((k == "text/html" for k in kinds if k in _ANSWERS), False)
 
 
 async def read_result(request: Request, job: Job) -> Any:

@@ -11,7 +11,13 @@ from stillpath.applications.controllers.figures import ControllerReport, LoopFig
 from stillpath.applications.controllers.options import ControllerOptions
 from stillpath.models.loops import builtin_loops
 from stillpath.service.api.access import Reader
-from stillpath.service.api.computing import WAITING, ComputeRequest, read_result, run_and_wait
+from stillpath.service.api.computing import (
+    WAITING,
+    ComputeRequest,
+    prefers_page,
+    read_result,
+    run_and_wait,
+)
 from stillpath.service.api.problems import Problem, responses
 from stillpath.service.jobs.state import JobKind
 
@@ -77,15 +83,9 @@ async def design_controller(
     )
     made = await read_result(request, await run_and_wait(request, caller, asked))
     vary = {"Vary": "Accept"}
-    wanted = format or ("html" if _first(accept) == "text/html" else "json")
+    wanted = format or ("html" if prefers_page(accept) else "json")
     if wanted == "html":
         return HTMLResponse(made["page"], headers=vary)
     if wanted == "c":
         return PlainTextResponse(made["c"], headers=vary)
     return Response(made["report"], media_type="application/json", headers=vary)
-
-
-def _first(accept: str) -> str:
-    """Return the kind that `Accept` names first of those there are."""
-    kinds = (part.split(";")[0].strip() for part in accept.split(","))
-    return next((k for k in kinds if k in ("text/html", "application/json", "*/*")), "*/*")

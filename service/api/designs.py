@@ -12,7 +12,13 @@ from stillpath.applications.design.figures import DesignReport
 from stillpath.compensation.defaults import DEFAULT_BASIS
 from stillpath.pipeline.options import BasisName, RobustMode
 from stillpath.service.api.access import Reader
-from stillpath.service.api.computing import WAITING, ComputeRequest, read_result, run_and_wait
+from stillpath.service.api.computing import (
+    WAITING,
+    ComputeRequest,
+    prefers_page,
+    read_result,
+    run_and_wait,
+)
 from stillpath.service.api.machines import Name, look_up
 from stillpath.service.api.problems import responses
 from stillpath.service.jobs.state import JobKind
@@ -31,7 +37,6 @@ async def _asked(
     robust: RobustMode = "auto",
 ) -> DesignReport:
     machine = await run_in_threadpool(look_up, request, name)
-
     job = await run_and_wait(
         request,
         caller,
@@ -61,10 +66,8 @@ async def read_design(found: Asked, accept: Annotated[str, Header()] = "*/*") ->
 
     The first request for a machine, axis, basis and robust mode takes some ten seconds.
     """
-    kinds = [part.split(";")[0].strip() for part in accept.split(",")]
-    first = next((k for k in kinds if k in ("text/html", "application/json", "*/*")), "*/*")
     vary = {"Vary": "Accept"}
-    if first == "text/html":
+    if prefers_page(accept):
         return await run_in_threadpool(_page, found, vary)
     return Response(found.model_dump_json(), media_type="application/json", headers=vary)
 

@@ -240,11 +240,8 @@ class Intake:
             revision=pinned.machine.revision,
             source_sha256=upload.sha256,
         )
-        prefix = f"jobs/{job_id}/"
-        files = {
-            f"{prefix}machine.json": incoming.with_suffix(".machine"),
-            f"{prefix}source/{job.source_name}": incoming,
-        }
+        (source,) = job.sources
+        files = {job.machine_file: incoming.with_suffix(".machine"), source: incoming}
         added = self._add(job, files, idempotency=idempotency, shared=shared, audit_row=audit_row)
         if added.id == job_id:
             tell(audit_row)
@@ -301,21 +298,21 @@ class Intake:
             raise _conflict(idempotency and idempotency[0]) from None
         finally:
             if added is None or added.id != job.id:
-                self._undo(job.id)
+                self._undo(job)
         return added
 
     def _taken(self, job: Job, is_new: bool, upload: Upload) -> Taken:
         return Taken(job, is_new, upload, self._store.queue_position(job))
 
-    def _undo(self, job_id: str) -> None:
+    def _undo(self, job: Job) -> None:
         """Delete what was stored for a job that was refused, or that another one stands for.
 
         What cannot be deleted now goes with the sweep. A database that broke off may have taken the
         job all the same: then its files stay.
         """
         with suppress(DatabaseAway, StorageError):
-            if self._store.get(job_id) is None:
-                self._storage.delete(f"jobs/{job_id}/")
+            if self._store.get(job.id) is None:
+                self._storage.delete(job.files)
 
     def _check_targets(self, wanted: JobQuery) -> None:
         """Refuse where nothing may be sent to."""

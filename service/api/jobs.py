@@ -192,13 +192,13 @@ async def delete_job(request: Request, job_id: JobId, caller: Submitter) -> Resp
     """Stop the job if it runs, and delete its files."""
     store: JobStore = request.app.state.store
     storage: Storage = request.app.state.storage
-    await find(request, job_id, caller)
+    job = await find(request, job_id, caller)
     if not await _written(request, lambda: store.forget(job_id)):
         raise no_such_job(job_id)
     # What a worker still puts there, or what cannot be deleted now, is swept up later. On a full
     # disk this makes the room to write down who did it.
     with suppress(StorageError):
-        await run_in_threadpool(storage.delete, f"jobs/{job_id}/")
+        await run_in_threadpool(storage.delete, job.files)
     await _changed(request, caller, "delete", job_id)
     return Response(status_code=204)
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from datetime import UTC, datetime
+from dataclasses import asdict
+from datetime import datetime
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response
@@ -63,7 +64,7 @@ class KeyView(BaseModel):
     @classmethod
     def of(cls, key: Key) -> KeyView:
         """Return the view of a key."""
-        return cls(**_fields(key))
+        return cls.model_validate(_fields(key))
 
 
 class NewKey(KeyView):
@@ -87,16 +88,7 @@ class AuditView(BaseModel):
     @classmethod
     def of(cls, entry: AuditEntry) -> AuditView:
         """Return the view of a row."""
-        return cls(
-            id=entry.id,
-            at=datetime.fromtimestamp(entry.at, UTC),
-            owner=entry.owner,
-            key_id=entry.key_id,
-            remote=entry.remote,
-            action=entry.action,
-            subject=entry.subject,
-            details=entry.details,
-        )
+        return cls.model_validate(entry, from_attributes=True)
 
 
 class AuditPage(BaseModel):
@@ -141,7 +133,7 @@ def create_key(request: Request, response: Response, asked: KeyCreate, caller: A
         scopes=sorted(key.scopes),
     )
     response.headers.update(_NO_STORE)
-    return NewKey(**_fields(key), key=secret)
+    return NewKey.model_validate(_fields(key) | {"key": secret})
 
 
 @router.delete(
@@ -193,17 +185,4 @@ def _keys(request: Request) -> KeyStore:
 
 
 def _fields(key: Key) -> dict[str, Any]:
-    return {
-        "id": key.id,
-        "name": key.name,
-        "owner": key.owner,
-        "scopes": sorted(key.scopes),
-        "created_at": _moment(key.created_at),
-        "expires_at": _moment(key.expires_at),
-        "revoked_at": _moment(key.revoked_at),
-        "used_at": _moment(key.used_at),
-    }
-
-
-def _moment(seconds: float | None) -> datetime | None:
-    return None if seconds is None else datetime.fromtimestamp(seconds, UTC)
+    return asdict(key) | {"scopes": sorted(key.scopes)}

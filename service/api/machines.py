@@ -21,6 +21,7 @@ from stillpath.models.machine import Machine
 from stillpath.models.provenance import SourceFile
 from stillpath.models.store import builtin_machines, load_machine, read_machine
 from stillpath.service.api.access import Admin, Reader
+from stillpath.service.api.file_responses import matches
 from stillpath.service.api.machine_views import (
     DiffView,
     HistoryView,
@@ -162,7 +163,7 @@ def show_machine(
     """Return the whole document of a machine: travel, limits, firmware, plants."""
     machine = look_up(request, name)
     response.headers["ETag"] = _etag(machine)
-    if if_none_match is not None and _names(if_none_match, machine):
+    if matches(if_none_match, _etag(machine)):
         return Response(status_code=304, headers={"ETag": _etag(machine)})
     return machine
 
@@ -370,7 +371,7 @@ def _check_state(store: MachineStore, name: str, if_match: str | None) -> int:
     """Return the current revision's number if it is the one that If-Match names, if it does."""
     _check_own(name)
     current = store.current(name)
-    if if_match is not None and not _names(if_match, current.machine):
+    if if_match is not None and not matches(if_match, _etag(current.machine)):
         raise _failed(
             f"Machine {name!r} is at {_etag(current.machine)} (revision {current.number}), not "
             f"{if_match[:80]}. Fetch it, make the change on that, and try again."
@@ -390,12 +391,6 @@ def _check_own(name: str) -> None:
 
 def _etag(machine: Machine) -> str:
     return f'"{machine.revision}"'
-
-
-def _names(header: str, machine: Machine) -> bool:
-    """Return whether a list of entity tags (RFC 9110, 13.1) holds the machine's."""
-    tags = [tag.strip().removeprefix("W/") for tag in header.split(",")]
-    return "*" in tags or _etag(machine) in tags
 
 
 def _failed(detail: str) -> Problem:

@@ -17,6 +17,7 @@ from importlib.resources.abc import Traversable
 from fastapi import APIRouter, Request
 from starlette.responses import Response
 
+from stillpath.service.api.file_responses import matches
 from stillpath.service.api.problems import Problem
 
 __all__ = ["Page", "PageFile", "page_files", "router"]
@@ -115,11 +116,7 @@ def read_asset(request: Request, version: str, path: str) -> Response:
 
 def _answer(request: Request, file: PageFile, caching: str) -> Response:
     headers = {**_SAFETY, "ETag": file.etag, "Cache-Control": caching, "Vary": "Accept-Encoding"}
-    asked = [
-        tag.strip().removeprefix("W/")
-        for tag in request.headers.get("if-none-match", "").split(",")
-    ]
-    if file.etag in asked:
+    if matches(request.headers.get("if-none-match"), file.etag):
         return Response(status_code=304, headers=headers)
     content = file.content
     if _takes_gzip(request.headers.get("accept-encoding", "")):

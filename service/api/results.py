@@ -18,7 +18,8 @@ from stillpath.service.api.file_responses import HEADERS, MEDIA, RANGES, stored
 from stillpath.service.api.job_lookup import JobId, find_done
 from stillpath.service.api.problems import Problem, responses
 from stillpath.service.api.schemas import LayerIndex
-from stillpath.service.jobs.state import Job, JobKind
+from stillpath.service.jobs.state import JobKind
+from stillpath.service.security.callers import Caller
 from stillpath.service.storage.base import Storage
 
 __all__ = ["Layers", "router"]
@@ -117,8 +118,7 @@ async def read_result(request: Request, job_id: JobId, caller: Reader) -> Respon
 @router.head("/report", include_in_schema=False)
 async def read_report(request: Request, job_id: JobId, caller: Reader) -> Response:
     """Return one self-contained HTML page."""
-    job = await find_done(request, job_id, caller)
-    return await _part(request, job, "report.html", "text/html")
+    return await _part(request, job_id, caller, "report.html", "text/html")
 
 
 @router.get(
@@ -130,8 +130,7 @@ async def read_report(request: Request, job_id: JobId, caller: Reader) -> Respon
 @router.head("/report.json", include_in_schema=False)
 async def read_report_json(request: Request, job_id: JobId, caller: Reader) -> Response:
     """Return every figure of the report, measured on the written file."""
-    job = await find_done(request, job_id, caller)
-    return await _part(request, job, "report.json", "application/json")
+    return await _part(request, job_id, caller, "report.json", "application/json")
 
 
 @router.get(
@@ -143,8 +142,7 @@ async def read_report_json(request: Request, job_id: JobId, caller: Reader) -> R
 @router.head("/layers", include_in_schema=False)
 async def read_layers(request: Request, job_id: JobId, caller: Reader) -> Response:
     """Return what layers there are: height, features, errors, and the size of their tiles."""
-    job = await find_done(request, job_id, caller)
-    return await _part(request, job, "layers.json", "application/json")
+    return await _part(request, job_id, caller, "layers.json", "application/json")
 
 
 @router.get(
@@ -180,8 +178,11 @@ async def read_layer(
     )
 
 
-async def _part(request: Request, job: Job, name: str, media_type: str) -> Response:
-    """Return a file of the report."""
+async def _part(
+    request: Request, job_id: str, caller: Caller, name: str, media_type: str
+) -> Response:
+    """Return a file of a job's report."""
+    job = await find_done(request, job_id, caller)
     return await stored(
         request,
         request.app.state.storage,

@@ -305,7 +305,7 @@ class Sender:
     def _machine(self, job: Job) -> Machine:
         """Return the machine that the job was done with."""
         try:
-            with self._storage.local(f"jobs/{job.id}/machine.json") as file:
+            with self._storage.local(job.machine_file) as file:
                 return PinnedMachine.read(file, job.machine).machine
         except FileNotFoundError:  # a job of an earlier version
             return load_machine(job.machine)

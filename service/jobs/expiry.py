@@ -14,12 +14,12 @@ from sqlalchemy import CursorResult, Engine, and_, delete, or_, select, update
 
 from stillpath.service.database import tables
 from stillpath.service.database.engine import insert, reading, writing
-from stillpath.service.jobs.state import JobKind, JobState
+from stillpath.service.jobs.state import JobKind
+from stillpath.service.jobs.stored_rows import OVER
 
 __all__ = ["Expiry"]
 
 _NAME = "sweep"
-_OVER = tuple(state.value for state in JobState if state.is_final)
 
 
 class Expiry:
@@ -48,7 +48,7 @@ class Expiry:
             now = float(connection.execute(added).scalar_one())
             connection.execute(
                 update(jobs)
-                .where(jobs.c.state.in_(_OVER), jobs.c.kept_from_s.is_(None))
+                .where(jobs.c.state.in_(OVER), jobs.c.kept_from_s.is_(None))
                 .values(kept_from_s=now)
             )
             connection.execute(
@@ -68,7 +68,7 @@ class Expiry:
         if answers_before is not None:
             is_answer = row.kind != JobKind.COMPENSATION.value
             is_old = or_(is_old, and_(is_answer, row.kept_from_s < answers_before))
-        query = select(row.id).where(row.state.in_(_OVER), is_old)
+        query = select(row.id).where(row.state.in_(OVER), is_old)
         with reading(self._engine) as connection:
             return list(connection.execute(query.order_by(row.kept_from_s, row.id)).scalars())
 

@@ -183,6 +183,16 @@ class Job:
         return f"{self.output}/result/{self.result_name}"
 
     @property
+    def files(self) -> str:
+        """Prefix in the storage under which all its files lie."""
+        return f"jobs/{self.id}/"
+
+    @property
+    def attempt_files(self) -> str:
+        """The part of them that the attempt under way puts there, or has put."""
+        return f"jobs/{self.id}/{self.attempt}"
+
+    @property
     def waits_for_room(self) -> bool:
         """Whether it would run if the disk had more room."""
         return self.state is JobState.QUEUED and self.stage == WAITING_FOR_ROOM

@@ -41,13 +41,12 @@ from stillpath.service.jobs.state import (
     Stale,
     advance,
 )
-from stillpath.service.jobs.stored_rows import from_row, stored_job, to_row
+from stillpath.service.jobs.stored_rows import OVER, from_row, stored_job, to_row
 from stillpath.service.jobs.submissions import Quota, same_job, submission, submit, usage
 
 __all__ = ["BadCursor", "JobStore", "Page"]
 
 _JOBS = tables.jobs.c
-_OVER = tuple(state.value for state in JobState if state.is_final)
 _CLOCKS_APART = 12
 """A lease this many times longer than allowed was taken before the clock was set."""
 
@@ -226,7 +225,7 @@ class JobStore:
     def ended_between(self, after: float, until: float) -> list[Job]:
         """Return the jobs that ended after a time and not later than another."""
         ended = (_JOBS.finished_at > after, _JOBS.finished_at <= until)
-        return self._jobs(select(tables.jobs).where(_JOBS.state.in_(_OVER), *ended))
+        return self._jobs(select(tables.jobs).where(_JOBS.state.in_(OVER), *ended))
 
     def usage(self, owner: str) -> tuple[int, int]:
         """Return how many jobs of an owner are not over, and the bytes of all that are kept."""

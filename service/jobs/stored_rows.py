@@ -10,8 +10,9 @@ from sqlalchemy import Connection, Row, bindparam, select
 from stillpath.service.database import tables
 from stillpath.service.jobs.state import Job, JobKind, JobState
 
-__all__ = ["NOT_OVER", "from_row", "stored_job", "to_row"]
+__all__ = ["NOT_OVER", "OVER", "from_row", "stored_job", "to_row"]
 
+OVER = tuple(state.value for state in JobState if state.is_final)
 NOT_OVER = tuple(state.value for state in JobState if not state.is_final)
 _FIELDS = tuple(field.name for field in fields(Job))
 _GET = select(tables.jobs).where(tables.jobs.c.id == bindparam("job_id"))

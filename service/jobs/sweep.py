@@ -175,7 +175,7 @@ def _dead_attempts(job: Job, files: list[Stat]) -> set[str]:
     """
     alive = {job.output}
     if job.state is JobState.RUNNING:
-        alive.add(f"{_JOBS}{job.id}/{job.attempt}")
+        alive.add(job.attempt_files)
     attempts = {
         f"{_JOBS}{job.id}/{part}"
         for part in (stat.key.split("/")[2] for stat in files)

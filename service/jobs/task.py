@@ -32,8 +32,6 @@ class Task:
         What is worth keeping between jobs.
     """
 
-    job_id: str
-    attempt: int
     machine: str
     machine_file: Path
     options: dict[str, Any]

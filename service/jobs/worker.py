@@ -249,9 +249,8 @@ def _no_room_in_storage(job: Job, workplace: Workplace) -> Event:
     needed = _written_bytes(job, workplace)
     room = None
     with contextlib.suppress(StorageError):
-        needed += sum(
-            stat.size_bytes for stat in workplace.storage.list(f"jobs/{job.id}/{job.attempt}/")
-        )
+        stored = workplace.storage.list(f"{job.attempt_files}/")
+        needed += sum(stat.size_bytes for stat in stored)
         room = workplace.storage.room()
     if room is not None and needed + job.source_bytes > room.total_bytes:
         return Failed(job.attempt, time.time(), storage_never_fits(needed, room.total_bytes))
@@ -296,16 +295,14 @@ def _work(job: Job, workplace: Workplace, runner: Runner, watch: Watch, folder: 
         cache.mkdir(parents=True, exist_ok=True)
         summary = runner(
             Task(
-                job.id,
-                job.attempt,
-                job.machine,
-                machine,
-                job.options,
-                sources,
-                target,
-                report,
-                cache,
-                job.kind,
+                machine=job.machine,
+                machine_file=machine,
+                options=job.options,
+                sources=sources,
+                target=target,
+                report=report,
+                cache_dir=cache,
+                kind=job.kind,
             ),
             watch.tell,
         )
@@ -313,10 +310,7 @@ def _work(job: Job, workplace: Workplace, runner: Runner, watch: Watch, folder: 
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     result_bytes = target.stat().st_size
-    output, output_bytes = (
-        f"jobs/{job.id}/{job.attempt}",
-        sum(path.stat().st_size for path in files),
-    )
+    output, output_bytes = job.attempt_files, sum(path.stat().st_size for path in files)
     for path in files:
         key = f"{output}/{path.relative_to(folder).as_posix()}"
         watch.check()
@@ -337,9 +331,9 @@ def _tidy(job: Job, workplace: Workplace) -> None:
     with contextlib.suppress(DatabaseAway, StorageError):  # then the sweep finds it
         row = workplace.store.get(job.id)
         if row is None:
-            workplace.storage.delete(f"jobs/{job.id}/")
-        elif row.output != f"jobs/{job.id}/{job.attempt}":
-            workplace.storage.delete(f"jobs/{job.id}/{job.attempt}/")
+            workplace.storage.delete(job.files)
+        elif row.output != job.attempt_files:
+            workplace.storage.delete(f"{job.attempt_files}/")
 
 
 def _patiently(

@@ -15,14 +15,14 @@ from stillpath.applications.proof.tower import tower_program, write_tower
 from stillpath.cli.main import run
 from stillpath.gcode.firmware.klipper.planner import Planner
 from stillpath.gcode.firmware.planning import join_phases
-from stillpath.gcode.interpreter import interpret_bytes
-from stillpath.gcode.types import Moves
+from stillpath.gcode.types import Moves, joined
 from stillpath.models.errors import ModelError
 from stillpath.models.firmware.klipper import FirmwareShaper
 from stillpath.models.machine import AxisTravel, Machine
 from stillpath.models.plants import Mode, ModesSpec, discretise
 from stillpath.models.store import builtin_machines, load_machine
 from stillpath.simulation.response import response
+from tests.gcode.cutting import blocks_of
 
 SETTINGS = PrintSettings()
 
@@ -36,12 +36,11 @@ def text_of(what: str, machine: Machine, settings: PrintSettings = SETTINGS) -> 
 
 def moves_of(data: bytes, machine: Machine) -> tuple[Moves, list[str], object]:
     """Interpreted and planned: a move outside the travel, or one refused, raises."""
-    blocks = interpret_bytes(data, machine)
+    blocks = blocks_of(data, machine)
     planner = Planner(machine.firmware)
     phases = join_phases([*(planner.push(block) for block in blocks), planner.flush()])
     assert len(phases)
-    names = Moves.__dataclass_fields__
-    moves = Moves(**{n: np.concatenate([getattr(b.moves, n) for b in blocks]) for n in names})
+    moves = joined([block.moves for block in blocks])
     last = blocks[-1].limits[int(blocks[-1].events.limits_id[-1])]
     return moves, [str(planner.time_s)], last
 

@@ -1,22 +1,11 @@
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import pytest
 
 from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine
-
-
-@pytest.fixture(scope="session")
-def shared_dir() -> Path:
-    beside = Path(__file__).parents[3] / "shared"
-    folder = Path(os.environ.get("STILLPATH_SHARED", beside))
-    if not folder.is_dir():
-        pytest.skip(f"NO SHARED TEST DATA at {folder}: set STILLPATH_SHARED")
-    return folder
-
 
 GOLDEN = Path(__file__).parents[2] / "examples" / "machines" / "klipper-golden.json"
 

@@ -8,17 +8,33 @@ from pathlib import Path
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.pieces import Piece, VerbatimPart
 from stillpath.gcode.splitter import Splitter
+from stillpath.gcode.types import ProgramBlock
+from stillpath.models.firmware.marlin import MarlinPlanner, PerAxis
 from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.piece_compensator import CompensatedPiece, PieceCompensator
 
-__all__ = ["HEAD", "compensated", "cut", "ender3_with", "pieces_of"]
+__all__ = ["HEAD", "MARLIN_PLANNER", "blocks_of", "compensated", "cut", "ender3_with", "pieces_of"]
 
 _SECTIONS = Path(__file__).parents[2] / "examples" / "firmware"
 
+MARLIN_PLANNER = MarlinPlanner(
+    max_accel_mm_s2=PerAxis(x=3000.0, y=3000.0, z=200.0, e=5000.0),
+    max_feedrate_mm_s=PerAxis(x=500.0, y=500.0, z=20.0, e=100.0),
+    accel_mm_s2=2000.0,
+    travel_accel_mm_s2=2000.0,
+    junction_deviation_mm=0.02,
+)
+
 HEAD = "G28\nG90\nM83\nG1 X50 Y50 Z5 F6000\nG1 X60 Y50 F6000\nG4 P10\n"
 """After this the machine stands still at 60, 50, 5."""
+
+
+def blocks_of(data: bytes, machine: Machine, *, strict_bounds: bool = True) -> list[ProgramBlock]:
+    """Interpret a whole file."""
+    interpreter = Interpreter(machine, strict_bounds=strict_bounds)
+    return [*interpreter.push(data), *interpreter.flush()]
 
 
 def cut(

@@ -13,7 +13,6 @@ from stillpath.gcode.firmware._encoding_kernels import lay_out
 from stillpath.gcode.firmware._writing_kernels import format_moves
 from stillpath.gcode.firmware.klipper import encoder as encoder_module
 from stillpath.gcode.firmware.registry import adapter
-from stillpath.gcode.interpreter import interpret_bytes
 from stillpath.gcode.pieces import Piece
 from stillpath.gcode.plan import plan_moves
 from stillpath.gcode.segments import ErrorFilter, fit_segments
@@ -24,7 +23,7 @@ from stillpath.models.store import load_machine
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.piece_compensator import CompensatedPiece, PieceCompensator, deviation
-from tests.gcode.cutting import HEAD, pieces_of
+from tests.gcode.cutting import HEAD, blocks_of, pieces_of
 
 BODIES = {
     "corners": "G1 X80 Y60 E1 F6000\nG1 X60 Y80 E1\nG1 X60 Y60 E1\n",
@@ -69,7 +68,7 @@ def test_executed_is_the_command(machine: Machine, work: PieceCompensator, name:
     assert np.mean(gap <= 6e-3) > 0.98
     # Time: the plan ends when the encoder says.
     p = encoded.phases
-    executed_s = (p.t_s + p.accel_s + p.cruise_s + p.decel_s)[-1] - p.t_s[0]
+    executed_s = p.end_s[-1] - p.t_s[0]
     line = result.timeline
     expected_s = encoded.group_start_s[-1] + line.end_s[-1] - line.start_s[-1] - line.start_s[0]
     assert executed_s == pytest.approx(expected_s, abs=1e-3)
@@ -237,7 +236,7 @@ def test_written_numbers_read_back(machine: Machine, seed: int, n: int) -> None:
     assert line_end[-1] == size
     assert text.count(b"\n") == n
     head = HEAD + "M221 S95\nM220 S80\nG92 X58.5 Y52\n"
-    blocks = interpret_bytes(head.encode() + text, machine)
+    blocks = blocks_of(head.encode() + text, machine)
     moves = blocks[-1].moves
     np.testing.assert_allclose(moves.end_mm[-n:, :3], position[:, :3] * 1e-6, atol=1e-9)
     np.testing.assert_allclose(moves.end_mm[-n:, 3], e * 1e-6, atol=1e-5)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from stillpath.gcode.firmware._encoding_kernels import MoveLimits
 from stillpath.gcode.firmware.klipper._encoder_kernels import MOST_LOST, expected_braking
 from stillpath.gcode.firmware.klipper._limit_kernels import move_limits
 
@@ -20,9 +21,9 @@ def test_limits_of_moves() -> None:
     start = np.cumsum(travel, axis=0) - travel
     limits = np.array([[500.0, 3e5, 500.0, 0.0], [80.0, 3000.0, 5.0, 0.5]])
     which = rng.integers(0, 2, n).astype(np.int32)
-    length, accel, speed, junction = np.empty((4, n))
-    stops = np.empty(n, bool)
-    move_limits(start, start + travel, which, limits, FACTS, length, accel, speed, junction, stops)
+    allowed, stops = MoveLimits(*np.empty((4, n))), np.empty(n, bool)
+    move_limits(start, start + travel, which, limits, FACTS, allowed, stops)
+    length, accel, speed, junction = allowed
     z_speed, z_accel, e_speed, e_accel, e_corner = FACTS
     travel = (start + travel) - start
     path = np.linalg.norm(travel[:, :3], axis=1)
@@ -65,7 +66,8 @@ def test_expected_braking_is_that_of_planned_speeds() -> None:
     length, planned = rng.uniform(0.01, 1.0, n), rng.uniform(1e-3, 1e-2, n)
     speed, accel, junction = rng.uniform(10.0, [[150.0], [3e4], [150.0]], (3, n))
     braking = np.full(n, np.nan)
-    expected_braking(ours, stops, length, planned, speed, accel, junction, braking)
+    allowed = MoveLimits(length, accel, speed, junction)
+    expected_braking(ours, stops, allowed, planned, braking)
     v = np.where(ours, np.minimum(length / planned, speed), speed)
     leave = np.append(np.minimum.reduce([v[:-1], v[1:], junction[1:]]) * ~stops[1:], 0.0)
     lost = np.minimum((v - leave) ** 2 / (2.0 * accel * v), MOST_LOST * planned)

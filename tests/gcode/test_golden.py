@@ -10,8 +10,8 @@ import pytest
 
 from stillpath.gcode.firmware.klipper.planner import Planner
 from stillpath.gcode.firmware.planning import join_phases
-from stillpath.gcode.interpreter import interpret_bytes
 from stillpath.models.machine import Machine
+from tests.gcode.cutting import blocks_of
 
 pytestmark = pytest.mark.shared
 
@@ -46,9 +46,7 @@ def test_same_plan_as_klipper(name: str, golden_machine: Machine, shared_dir: Pa
     source = shared_dir / "corpus" / "own" / f"{name.split('__')[0]}.gcode.gz"
     machine = machine_of(name, golden_machine)
     planner = Planner(machine.firmware)
-    parts = [
-        planner.push(b) for b in interpret_bytes(gzip.decompress(source.read_bytes()), machine)
-    ]
+    parts = [planner.push(b) for b in blocks_of(gzip.decompress(source.read_bytes()), machine)]
     plan = join_phases([*parts, planner.flush()])
 
     times = np.column_stack(
@@ -71,5 +69,5 @@ def test_same_plan_as_klipper(name: str, golden_machine: Machine, shared_dir: Pa
     m = len(golden["e"])
     np.testing.assert_allclose(e[:m], golden["e"], rtol=0.0, atol=1e-9)
 
-    end = plan.t_s[-1] + plan.accel_s[-1] + plan.cruise_s[-1] + plan.decel_s[-1]
+    end = plan.end_s[-1]
     assert end == pytest.approx(float(golden["total_time_s"]), rel=0.0, abs=1e-8)

@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 
 from stillpath.gcode.errors import GcodeError
-from stillpath.gcode.interpreter import Interpreter, interpret_bytes
+from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.types import EventKind, ProgramBlock
 from stillpath.models.machine import Machine
+from tests.gcode.cutting import blocks_of
 
 
 def run(text: str, machine: Machine) -> ProgramBlock:
     """The one block of a small program."""
-    (block,) = interpret_bytes(text.encode(), machine)
+    (block,) = blocks_of(text.encode(), machine)
     return block
 
 
@@ -100,7 +101,7 @@ def test_limits_of_remembered_lines(golden_machine: Machine) -> None:
             note = f" ; {k}" if numbered else ""  # such a line has never been seen before
             lines += [f"M204 S{accel}{note}", f"SET_VELOCITY_LIMIT VELOCITY={velocity}{note}"]
             lines += [";TYPE:Perimeter", f"G1 X{k + 2}"] * (k % 3 > 0)
-        blocks = interpret_bytes("\n".join(lines).encode(), golden_machine)
+        blocks = blocks_of("\n".join(lines).encode(), golden_machine)
         return [
             ([b.limits[n] for n in b.moves.limits_id], [b.limits[n] for n in b.events.limits_id])
             for b in blocks
@@ -167,7 +168,7 @@ def test_bounds_only_where_known(wary_machine: Machine) -> None:
     run("G91\nG1 X5000\n", wary_machine)
     with pytest.raises(GcodeError, match="X 5000"):
         run("G1 X5000\n", wary_machine)
-    (block,) = interpret_bytes(b"G1 X5000\n", wary_machine, strict_bounds=False)
+    (block,) = blocks_of(b"G1 X5000\n", wary_machine, strict_bounds=False)
     assert len(block.moves) == 1
 
 
@@ -353,10 +354,10 @@ def test_corpus_bytes_are_covered(golden_machine: Machine, shared_dir: Path) -> 
         name = path.name.split(".")[0]
         if name in REFUSED:
             with pytest.raises(GcodeError, match=REFUSED[name]) as caught:
-                interpret_bytes(data, golden_machine)
+                blocks_of(data, golden_machine)
             assert caught.value.line
             continue
-        blocks = interpret_bytes(data, golden_machine)
+        blocks = blocks_of(data, golden_machine)
         assert b"".join(block.text for block in blocks) == data
 
 

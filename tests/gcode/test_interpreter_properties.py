@@ -9,9 +9,10 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from stillpath.gcode.errors import GcodeError
-from stillpath.gcode.interpreter import Interpreter, interpret_bytes
+from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.types import Events, Moves, ProgramBlock
 from stillpath.models.machine import Machine
+from tests.gcode.cutting import blocks_of
 
 relaxed = settings(
     deadline=None,
@@ -138,7 +139,7 @@ def test_python_reads_as_the_kernel_does(golden_machine: Machine, data: bytes) -
 @pytest.mark.parametrize("count", [300, 3000])
 def test_tables_grow(golden_machine: Machine, count: int) -> None:
     text = "G28\nG91\n" + "".join(f"M204 S{1000 + k}\nG1 X.001 F{1000 + k}\n" for k in range(count))
-    blocks = interpret_bytes(text.encode(), golden_machine)
+    blocks = blocks_of(text.encode(), golden_machine)
     moves, last = blocks[-1].moves, blocks[-1]
     assert len({limit.accel_mm_s2 for limit in last.limits}) == count + 1
     assert last.limits[moves.limits_id[-1]].accel_mm_s2 == 999 + count
@@ -147,7 +148,7 @@ def test_tables_grow(golden_machine: Machine, count: int) -> None:
 def test_long_arcs_and_many_lines(golden_machine: Machine) -> None:
     """Blocks are flushed when full; one arc may be longer than a block."""
     text = "G28\nG1 X900\n" + "G2 I-900 J0\n" * 2 + "G1 X0\nG1 X1\n" * 30_000
-    blocks = interpret_bytes(text.encode(), golden_machine)
+    blocks = blocks_of(text.encode(), golden_machine)
     assert len(blocks) > 2
     assert sum(len(block.moves) for block in blocks) == 1 + 2 * 56_548 + 60_000
     assert b"".join(block.text for block in blocks) == text.encode()

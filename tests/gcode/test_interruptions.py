@@ -45,7 +45,7 @@ def velocity_step(moves: Moves, limits: list[Limits], machine: Machine) -> float
     phases = plan_moves(moves, limits, machine)
     # RepRapFirmware holds moves back by some hundredths of a ms where they come too fast: late
     # steps, which this does not count.
-    lasts_s = phases.accel_s + phases.cruise_s + phases.decel_s
+    lasts_s = phases.lasts_s
     ends_s = phases.t_s[0] + np.cumsum(lasts_s)
     phases = replace(phases, t_s=ends_s - lasts_s)
     count = int((ends_s[-1] - ends_s[0] + lasts_s[0]) / _SAMPLE_S) + 41
@@ -126,7 +126,7 @@ def test_waits_of_a_queue_leave_no_motor_behind(factor: float) -> None:
     """
     machine = ender3_with("reprapfirmware")
     phases = plan_moves(*written(*compensated(HEAD + BODY, machine), factor), machine)
-    ends_s = phases.t_s + phases.accel_s + phases.cruise_s + phases.decel_s
+    ends_s = phases.end_s
     waits_s = np.maximum(phases.t_s[1:] - ends_s[:-1], 0.0)
     late_mm = waits_s * np.minimum(phases.end_mm_s[:-1], phases.start_mm_s[1:])
     assert late_mm.max() <= 0.05

@@ -17,13 +17,13 @@ from stillpath.gcode.firmware.marlin.planner import Planner
 from stillpath.gcode.firmware.marlin.stream_commands import MarlinStreamCommands
 from stillpath.gcode.sampler import sample_phases
 from stillpath.models.firmware import Marlin
-from stillpath.models.firmware.marlin import MarlinPlanner, PerAxis
+from stillpath.models.firmware.marlin import PerAxis
 from stillpath.models.machine import CommandLimits, Machine
 from stillpath.models.store import load_machine
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.piece_compensator import CompensatedPiece, PieceCompensator, Unfit
-from tests.gcode.cutting import HEAD, pieces_of
+from tests.gcode.cutting import HEAD, MARLIN_PLANNER, pieces_of
 
 K_S = 0.05
 PER_MM, E_PER_MM, FED = 80.0, 400.0, 0.033
@@ -137,13 +137,7 @@ def machine_of(**changes: Any) -> Machine:
         min_steps_per_segment=1,
         home_mm=(0.0, 0.0, 0.0),
         steps_per_mm=PerAxis(x=80.0, y=80.0, z=400.0, e=400.0),
-        planner=MarlinPlanner(
-            max_accel_mm_s2=PerAxis(x=3000.0, y=3000.0, z=200.0, e=5000.0),
-            max_feedrate_mm_s=PerAxis(x=500.0, y=500.0, z=20.0, e=100.0),
-            accel_mm_s2=2000.0,
-            travel_accel_mm_s2=2000.0,
-            junction_deviation_mm=0.02,
-        ),
+        planner=MARLIN_PLANNER,
     )
     own = firmware.model_copy(update={"linear_advance": True, **changes})
     return load_machine("ender3").model_copy(update={"firmware": own})

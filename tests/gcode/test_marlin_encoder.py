@@ -11,7 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stillpath.gcode.firmware.marlin._encoder_kernels import assign_rates, bend_reversals, thin
+from stillpath.gcode.firmware.marlin._encoder_kernels import (
+    Blocks,
+    assign_rates,
+    bend_reversals,
+    thin,
+)
 from stillpath.gcode.firmware.marlin.adapter import MarlinAdapter
 from stillpath.gcode.firmware.marlin.encoder import stream_limits
 from stillpath.gcode.firmware.marlin.limits import MarlinLimits, initial_limits
@@ -23,20 +28,14 @@ from stillpath.models.machine import CommandLimits, Machine
 from stillpath.models.store import load_machine
 from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.options import Options
-from tests.gcode.cutting import HEAD
+from tests.gcode.cutting import HEAD, MARLIN_PLANNER
 from tests.gcode.prints import polygon
 from tests.gcode.states import differences, tagged
 
 FIRMWARE = Marlin(
     min_steps_per_segment=1,
     steps_per_mm=PerAxis(x=160.0, y=160.0, z=400.0, e=400.0),
-    planner=MarlinPlanner(
-        max_accel_mm_s2=PerAxis(x=3000.0, y=3000.0, z=200.0, e=5000.0),
-        max_feedrate_mm_s=PerAxis(x=500.0, y=500.0, z=20.0, e=100.0),
-        accel_mm_s2=2000.0,
-        travel_accel_mm_s2=2000.0,
-        junction_deviation_mm=0.02,
-    ),
+    planner=MARLIN_PLANNER,
 )
 
 
@@ -102,25 +101,9 @@ def test_rates_reach_the_ends_in_time(seed: int, per_mm: float) -> None:
     speed = 60.0 + 40.0 * np.sin(np.cumsum(rng.normal(0.0, 0.2, n)))
     steps = np.maximum(np.round(speed * planned_s * per_mm), 1.0)
     feedrate, predicted = np.zeros(n), np.zeros(n)
-    assign_rates(
-        np.ones(n, np.bool_),
-        steps,
-        steps / per_mm,
-        np.cumsum(planned_s),
-        planned_s,
-        np.full(n, 500.0),
-        np.zeros(n),
-        np.zeros(n),
-        np.zeros(n),
-        20_000.0,
-        False,
-        False,
-        2e6,
-        120.0,
-        0.0,
-        feedrate,
-        predicted,
-    )
+    ours, fastest, none = np.ones(n, np.bool_), np.full(n, 500.0), np.zeros(n)
+    blocks = Blocks(ours, steps, steps / per_mm, np.cumsum(planned_s), planned_s, fastest)
+    assign_rates(blocks, none, none, False, 2e6, 120.0, 0.0, feedrate, predicted)
     late_s = np.cumsum(predicted)[5:] - np.cumsum(planned_s)[5:]
     # A block may end early by the share of a step that the next one loses.
     assert np.all(late_s < 1.5e-4)
@@ -137,10 +120,8 @@ def test_what_a_stand_is_too_short_is_made_up_for() -> None:
     ours, free = np.ones(4, np.bool_), np.zeros(4)
     ends_s = np.cumsum(planned_s)
     per_mm, fastest = 80.0, np.full(4, 500.0)
-    assign_rates(
-        *(ours, steps, steps / per_mm, ends_s, planned_s, fastest, free, free, free, 20_000.0),
-        *(False, True, 2e6, 120.0, 0.0, feedrate, predicted),
-    )
+    blocks = Blocks(ours, steps, steps / per_mm, ends_s, planned_s, fastest)
+    assign_rates(blocks, free, free, True, 2e6, 120.0, 0.0, feedrate, predicted)
     assert predicted[1] == pytest.approx(1 / 120.0, rel=1e-3)
     assert np.sum(predicted) == pytest.approx(ends_s[-1], abs=1e-4)
 

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from stillpath.gcode.errors import GcodeError
+from stillpath.gcode.firmware.encoding import as_moves
 from stillpath.gcode.firmware.marlin.limits import MarlinLimits, initial_limits
 from stillpath.gcode.firmware.marlin.planner import Planner
 from stillpath.gcode.firmware.planning import join_phases
@@ -43,22 +44,8 @@ def moves_through(points: Any, speed_mm_s: Any, limits_id: int = 0) -> Moves:
     full = np.zeros((len(points), 4))
     full[:, : points.shape[1]] = points
     n = len(full) - 1
-    small, count = np.zeros(n, np.int32), np.arange(n, dtype=np.int64)
-    return Moves(
-        start_mm=full[:-1],
-        end_mm=full[1:],
-        speed_mm_s=np.broadcast_to(np.asarray(speed_mm_s, np.float64), n).copy(),
-        limits_id=small + np.int32(limits_id),
-        modal_id=small,
-        known=np.full(n, 7, np.uint8),
-        line=count + 1,
-        byte_start=count,
-        byte_end=count + 1,
-        layer=small,
-        feature=small,
-        object_id=small,
-        tool=small,
-    )
+    speed = np.broadcast_to(np.asarray(speed_mm_s, np.float64), n).copy()
+    return as_moves(full[:-1], full[1:], speed, np.full(n, limits_id, np.int32))
 
 
 def plan(
@@ -71,10 +58,6 @@ def plan(
     )
 
 
-def duration(phases: Phases) -> Any:
-    return phases.accel_s + phases.cruise_s + phases.decel_s
-
-
 # Steps and speeds
 
 
@@ -82,7 +65,7 @@ def test_positions_are_whole_steps() -> None:
     # .0874 mm * 80 = 6.99 steps -> 7 = .0875 mm; on to .2 mm = 16 steps: 9 more = .1125 mm.
     phases = plan(machine(), [[0], [0.0874], [0.2]], 20.0)
     assert phases.start_mm[:, 0] == pytest.approx([0.0, 0.0875])
-    way = phases.cruise_mm_s * duration(phases)
+    way = phases.cruise_mm_s * phases.lasts_s
     assert phases.direction[:, 0].tolist() == [1.0, 1.0]
     assert np.all(way >= 0.0875 - 1e-9)
 
@@ -110,7 +93,7 @@ def test_smoothing_counts_ticks_of_parts_of_steps() -> None:
     # two times floor(2e6 / 31800) = 62 ticks, not 125.
     firmware = machine(step_timer_hz=2e6, step_smoothing_hz=60_000.0)
     phases = plan(firmware, [[0], [100], [200], [300]], 198.75, **STREAM)
-    assert duration(phases)[1] == pytest.approx(8000 * 124 / 2e6, rel=1e-6)
+    assert phases.lasts_s[1] == pytest.approx(8000 * 124 / 2e6, rel=1e-6)
 
 
 def test_every_axis_keeps_its_speed() -> None:
@@ -299,11 +282,11 @@ def test_short_moves_are_swallowed_and_made_up_for() -> None:
     # .05 mm are 4 steps: nothing moves. With the next .05 mm it is 8 steps from the start.
     phases = plan(machine(), [[0], [0.05], [0.1], [10]], 20.0)
     assert len(phases) == 3
-    assert duration(phases)[0] == 0.0
+    assert phases.lasts_s[0] == 0.0
     assert phases.direction[0, 0] == 1.0
     assert phases.start_mm[:, 0] == pytest.approx([0.0, 0.0, 0.1])
     # A build with MIN_STEPS_PER_SEGMENT 1 executes both.
-    assert np.all(duration(plan(machine(min_steps_per_segment=1), [[0], [0.05], [0.1]], 20.0)) > 0)
+    assert np.all(plan(machine(min_steps_per_segment=1), [[0], [0.05], [0.1]], 20.0).lasts_s > 0)
 
 
 def test_rests_of_a_file_stay_apart_from_what_the_firmware_joins_with_them() -> None:
@@ -315,9 +298,9 @@ def test_rests_of_a_file_stay_apart_from_what_the_firmware_joins_with_them() -> 
     swallowed, told = (
         Planner(firmware, rests_apart=apart).plan_whole(moves, limits) for apart in (False, True)
     )
-    assert duration(swallowed)[1] == 0.0
+    assert swallowed.lasts_s[1] == 0.0
     assert swallowed.direction[2, 0] > 0.0
-    assert np.all(duration(told) > 0.0)
+    assert np.all(told.lasts_s > 0.0)
     assert told.direction[2, 0] == 0.0
     np.testing.assert_allclose(told.start_mm[2, :2], [10.05, 0.0], atol=1e-9)
 
@@ -335,12 +318,12 @@ def test_segments_are_stretched_while_the_queue_fills() -> None:
     points = np.arange(0.0, 40.0)[:, None]
     caps = {**STREAM, "min_segment_time_us": 20_000.0}
     phases = plan(machine(), points, 100.0, **caps)
-    assert duration(phases)[2] == pytest.approx(0.020, abs=2e-4)
-    assert duration(phases)[5] == pytest.approx(0.015, abs=2e-4)
-    assert duration(phases)[10:30] == pytest.approx(0.010, abs=1e-6)
+    assert phases.lasts_s[2] == pytest.approx(0.020, abs=2e-4)
+    assert phases.lasts_s[5] == pytest.approx(0.015, abs=2e-4)
+    assert phases.lasts_s[10:30] == pytest.approx(0.010, abs=1e-6)
     # M205 B0, or a build without SLOWDOWN.
     caps["min_segment_time_us"] = 0.0
-    assert duration(plan(machine(), points, 100.0, **caps))[2] == pytest.approx(0.01, abs=1e-6)
+    assert plan(machine(), points, 100.0, **caps).lasts_s[2] == pytest.approx(0.01, abs=1e-6)
 
 
 def test_the_queue_sees_thirteen_blocks() -> None:
@@ -363,7 +346,7 @@ def test_a_stop_ends_the_queue() -> None:
     then = join_phases(
         [planner.push_moves(moves_through([[50], [99]], 60.0), table), planner.flush()]
     )
-    assert then.t_s[0] == pytest.approx(duration(first)[0] + 0.5)
+    assert then.t_s[0] == pytest.approx(first.lasts_s[0] + 0.5)
     assert then.start_mm_s[0] == pytest.approx(1.5)
     assert then.move_index.tolist() == [1]
 
@@ -376,7 +359,7 @@ def test_the_releases_lose_a_step_where_the_stream_speeds_up() -> None:
     # 10.125 ms. From 100 to 50 nothing is lost: floor() leaves no step to brake in.
     points = np.arange(0.0, 9.0)[:, None]
     speed = [50, 50, 50, 100, 100, 100, 50, 50]
-    time_s = duration(plan(machine(), points, speed, **STREAM))
+    time_s = plan(machine(), points, speed, **STREAM).lasts_s
     assert time_s[2:7] == pytest.approx([0.02, 0.010125, 0.01, 0.01, 0.02], abs=1e-7)
 
 
@@ -387,7 +370,7 @@ def test_bugfix_loses_a_step_where_the_stream_slows_down() -> None:
     points = np.arange(0.0, 9.0)[:, None]
     speed = [50, 50, 50, 100, 100, 100, 50, 50]
     firmware = machine(variant="bugfix", min_steps_per_segment=1)
-    time_s = duration(plan(firmware, points, speed, **STREAM))
+    time_s = plan(firmware, points, speed, **STREAM).lasts_s
     expected = [0.02, 0.01 + 1 / 6325 - 1 / 8000, 0.01, 0.010125, 0.02]
     assert time_s[2:7] == pytest.approx(expected, abs=2e-7)
 
@@ -397,7 +380,7 @@ def test_s_curve_takes_the_same_time() -> None:
     straight, curved = (plan(machine(s_curve=s), line, 60.0) for s in (False, True))
     assert not straight.s_curve.any()
     assert curved.s_curve.all()
-    assert duration(curved).sum() == pytest.approx(duration(straight).sum(), rel=0.03)
+    assert curved.lasts_s.sum() == pytest.approx(straight.lasts_s.sum(), rel=0.03)
 
 
 def test_an_s_curve_within_a_step_is_not_seen() -> None:
@@ -405,7 +388,7 @@ def test_an_s_curve_within_a_step_is_not_seen() -> None:
     points = np.arange(0.0, 9.0)[:, None]
     speed = [50, 50, 50, 100, 100, 100, 50, 50]
     times = [
-        duration(plan(machine(s_curve=s, min_steps_per_segment=1), points, speed, **STREAM))
+        plan(machine(s_curve=s, min_steps_per_segment=1), points, speed, **STREAM).lasts_s
         for s in (False, True)
     ]
     assert times[1][1:-1] == pytest.approx(times[0][1:-1], abs=1e-9)
@@ -430,7 +413,7 @@ def test_an_s_curve_is_looked_at_step_by_step() -> None:
     for _ in range(3):
         down_s += 1.0 / rate(peak, first, down_s)
     limits = {"print_accel_mm_s2": 500.0, "travel_accel_mm_s2": 500.0}
-    planned = duration(plan(machine(s_curve=True), [[0], [0.1]], 20.0, **limits))
+    planned = plan(machine(s_curve=True), [[0], [0.1]], 20.0, **limits).lasts_s
     assert planned[0] == pytest.approx(up_s + down_s, rel=1e-5)
 
 

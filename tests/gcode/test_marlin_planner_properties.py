@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from stillpath.gcode.firmware.encoding import as_moves
 from stillpath.gcode.firmware.marlin._block_kernels import (
     Q_ACCEL,
     Q_FLOOR2,
@@ -26,7 +27,7 @@ from stillpath.gcode.firmware.marlin._planner_kernels import _step_time, settle
 from stillpath.gcode.firmware.marlin.limits import initial_limits
 from stillpath.gcode.firmware.marlin.planner import Planner, planner_facts
 from stillpath.gcode.firmware.planning import join_phases
-from stillpath.gcode.types import Moves, Phases
+from stillpath.gcode.types import Moves, Phases, rows_of
 from stillpath.models.firmware import Marlin
 from stillpath.models.firmware.marlin import PerAxis
 
@@ -53,31 +54,13 @@ def streams(draw: st.DrawFn) -> Moves:
     step *= [1.0, 1.0, 0.05, 0.05]
     step[rng.random((n, 4)) < draw(st.sampled_from([0.0, 0.3, 0.7]))] = 0.0
     points = np.vstack((np.zeros(4), np.cumsum(step, axis=0)))
-    small, count = np.zeros(n, np.int32), np.arange(n, dtype=np.int64)
-    return Moves(
-        start_mm=points[:-1],
-        end_mm=points[1:],
-        speed_mm_s=rng.uniform(1.0, 300.0, n),
-        limits_id=small,
-        modal_id=small,
-        known=np.full(n, 7, np.uint8),
-        line=count + 1,
-        byte_start=count,
-        byte_end=count + 1,
-        layer=small,
-        feature=small,
-        object_id=small,
-        tool=small,
-    )
+    speed = rng.uniform(1.0, 300.0, n)
+    return as_moves(points[:-1], points[1:], speed, np.zeros(n, np.int32))
 
 
 def plan(firmware: Marlin, parts: list[Moves], *, corexy: bool = False) -> Phases:
     planner, table = Planner(firmware, corexy=corexy), [initial_limits(firmware)]
     return join_phases([*(planner.push_moves(part, table) for part in parts), planner.flush()])
-
-
-def duration(phases: Phases) -> NDArray[np.float64]:
-    return phases.accel_s + phases.cruise_s + phases.decel_s
 
 
 @given(MACHINES, streams(), st.booleans())
@@ -88,7 +71,7 @@ def test_what_every_plan_keeps(firmware: Marlin, moves: Moves, corexy: bool) -> 
     for name in ("accel_s", "cruise_s", "decel_s"):
         assert np.all(getattr(phases, name) >= -1e-12)
     # Time goes on without gaps.
-    assert phases.t_s[1:] == pytest.approx(phases.t_s[:-1] + duration(phases)[:-1], abs=1e-9)
+    assert phases.t_s[1:] == pytest.approx(phases.t_s[:-1] + phases.lasts_s[:-1], abs=1e-9)
     # Each row ends where the next begins, and that is within a short move of where it should be.
     up, down = phases.accel_s, phases.decel_s
     path = 0.5 * (phases.start_mm_s + phases.cruise_mm_s) * up
@@ -100,7 +83,7 @@ def test_what_every_plan_keeps(firmware: Marlin, moves: Moves, corexy: bool) -> 
     assert np.all(np.abs(end - moves.end_mm) <= short + 1e-6)
     # Caps of speed, but for a step per second and a tick.
     limit = firmware.planner.max_feedrate_mm_s
-    executed = duration(phases) > 0.0
+    executed = phases.lasts_s > 0.0
     least = 130.0 / 80.0
     for axis, cap in ((2, limit.z), (3, limit.e)):
         v = np.abs(phases.direction[executed, axis]) * phases.cruise_mm_s[executed]
@@ -111,10 +94,7 @@ def test_what_every_plan_keeps(firmware: Marlin, moves: Moves, corexy: bool) -> 
 @settings(max_examples=80, deadline=None)
 def test_cutting_the_stream_changes_nothing(firmware: Marlin, moves: Moves, cuts: Any) -> None:
     bounds = sorted({0, len(moves), *(min(c, len(moves)) for c in cuts)})
-    parts = [
-        Moves(*(getattr(moves, name)[a:b] for name in Moves.__dataclass_fields__))
-        for a, b in pairwise(bounds)
-    ]
+    parts = [rows_of(moves, slice(a, b)) for a, b in pairwise(bounds)]
     whole, cut = plan(firmware, [moves]), plan(firmware, parts)
     for name in Phases.__dataclass_fields__:
         assert getattr(cut, name) == pytest.approx(getattr(whole, name), rel=1e-9, abs=1e-12)
@@ -125,7 +105,7 @@ def test_cutting_the_stream_changes_nothing(firmware: Marlin, moves: Moves, cuts
 def test_ideal_trapezoids_join_without_steps_of_speed(moves: Moves) -> None:
     firmware = Marlin(variant="prusa", min_steps_per_segment=1)
     phases = plan(firmware, [moves])
-    moving = duration(phases) > 0.0
+    moving = phases.lasts_s > 0.0
     start, end = phases.start_mm_s[moving], phases.end_mm_s[moving]
     assert end[:-1] == pytest.approx(start[1:], rel=1e-6, abs=1e-6)
 

@@ -47,7 +47,7 @@ def made_on(machine: Machine) -> tuple[Piece, CompensatedPiece]:
 
 
 def seconds(phases: Phases) -> float:
-    return float(np.sum(phases.accel_s + phases.cruise_s + phases.decel_s))
+    return float(np.sum(phases.lasts_s))
 
 
 @pytest.mark.parametrize("kind", ["klipper", "marlin", "reprapfirmware"])

@@ -13,10 +13,10 @@ from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.klipper.limits import KlipperLimits
 from stillpath.gcode.firmware.klipper.planner import Planner
 from stillpath.gcode.firmware.planning import join_phases
-from stillpath.gcode.interpreter import interpret_bytes
-from stillpath.gcode.types import Moves, Phases
+from stillpath.gcode.types import Moves, Phases, rows_of
 from stillpath.models.firmware import Klipper
 from stillpath.models.machine import Machine
+from tests.gcode.cutting import blocks_of
 
 FIRMWARE = Klipper()
 LIMITS = [KlipperLimits(500.0, 5000.0, 5.0, 0.5), KlipperLimits(80.0, 1000.0, 8.0, 0.0)]
@@ -47,7 +47,7 @@ def moves_of(
 
 
 def part_of(moves: Moves, a: int, b: int) -> Moves:
-    return Moves(*(getattr(moves, name)[a:b] for name in Moves.__dataclass_fields__))
+    return rows_of(moves, slice(a, b))
 
 
 def plan_moves(moves: Moves, limits: list[KlipperLimits], firmware: Klipper) -> Phases:
@@ -117,7 +117,7 @@ def test_extruder_refuses() -> None:
 
 def test_stops_of_a_block(golden_machine: Machine) -> None:
     text = b"G28\nG1 X10 F6000\nM106\nG1 X20\nG4 P500\nG1 X30\nM400\nEXCLUDE_OBJECT_END\nG1 X40\n"
-    (block,) = interpret_bytes(text, golden_machine)
+    (block,) = blocks_of(text, golden_machine)
     planner = Planner(golden_machine.firmware)
     plan = join_phases([planner.push(block), planner.flush()])
     assert plan.end_mm_s.tolist() == [100, 0, 0, 0]

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stillpath.gcode.errors import GcodeError
+from stillpath.gcode.firmware._encoding_kernels import MoveLimits
 from stillpath.gcode.firmware.encoding import as_moves
 from stillpath.gcode.firmware.planning import join_phases
 from stillpath.gcode.firmware.registry import adapter
@@ -184,7 +185,7 @@ def test_rests_run_under_the_files_own_limits() -> None:
     made = compensated(machine, BODIES["retraction"])
     rows = np.flatnonzero(made.encoded.row >= 0)
     phases = made.encoded.phases
-    lasts = (phases.accel_s + phases.cruise_s + phases.decel_s)[rows]
+    lasts = (phases.lasts_s)[rows]
     # After a rest the motion goes on with at most the stream's jerk of the extruder, 10 mm/s, so
     # that up to 10 / 5000 s of its braking fall away.
     longest = 0.8 / 35.0 + 35.0 / 5000.0
@@ -209,7 +210,7 @@ def test_a_dense_stream_is_thinned_out_for_a_short_queue() -> None:
     # 7 moves must last 27 ms: none of them may be the 1 ms that a corner would like.
     short = compensated(machine_of(firmware(ring_length=16)), BODIES["corners"])
     phases = short.encoded.phases
-    total = np.cumsum(np.append(0.0, phases.accel_s + phases.cruise_s + phases.decel_s))
+    total = np.cumsum(np.append(0.0, phases.lasts_s))
     assert np.min(total[7:] - total[:-7]) >= 27e-3
     long = compensated(machine_of(firmware(ring_length=100)), BODIES["corners"])
     assert len(long.encoded.row) > len(short.encoded.row)
@@ -308,12 +309,9 @@ def _missed_s(steps: list[tuple[float, float, float]]) -> float:
     feedrate, predicted = np.zeros(n), np.zeros(n)
     assign_speeds(
         np.ones(n, np.bool_),
-        length,
+        MoveLimits(length, accel, np.full(n, 500.0), junction),
         np.cumsum(planned),
         planned,
-        np.full(n, 500.0),
-        accel,
-        junction,
         np.zeros(n),
         0.0,
         own.step_clock_hz,
@@ -323,7 +321,7 @@ def _missed_s(steps: list[tuple[float, float, float]]) -> float:
     planner = RepRapPlanner(own, "cartesian")
     moves = as_moves(places[:-1], places[1:], feedrate / 60.0, np.zeros(n, np.int32))
     phases = join_phases([planner.push_moves(moves, [limits]), planner.flush()])
-    lasts = phases.accel_s + phases.cruise_s + phases.decel_s
+    lasts = phases.lasts_s
     # The stream is not braked for its end: the last moves are left out.
     settled = np.flatnonzero(np.cumsum(length[::-1])[::-1] > 2.0)
     return float(np.max(np.abs(lasts - predicted)[settled], initial=0.0))
@@ -340,12 +338,9 @@ def test_a_long_segment_a_little_faster_than_its_neighbours_is_in_time(excess_mm
     feedrate, predicted, length = np.zeros(n), np.zeros(n), speed * planned
     assign_speeds(
         np.ones(n, np.bool_),
-        length,
+        MoveLimits(length, accel, np.full(n, 500.0), np.full(n, 500.0)),
         np.cumsum(planned),
         planned,
-        np.full(n, 500.0),
-        accel,
-        np.full(n, 500.0),
         np.zeros(n),
         0.0,
         750e3,

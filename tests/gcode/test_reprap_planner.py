@@ -15,7 +15,7 @@ from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.planning import join_phases
 from stillpath.gcode.firmware.reprapfirmware.limits import RepRapLimits
 from stillpath.gcode.firmware.reprapfirmware.planner import RepRapPlanner
-from stillpath.gcode.types import Moves, Phases
+from stillpath.gcode.types import Moves, Phases, rows_of
 from stillpath.models.firmware import RepRapFirmware
 from stillpath.models.firmware.reprapfirmware import Drive, RepRapExtruder
 
@@ -61,17 +61,12 @@ def plan(
 ) -> Phases:
     planner = RepRapPlanner(firmware, kinematics)
     edges = [0, *sorted(cuts), len(moves)]
-    parts = [
-        planner.push_moves(
-            Moves(*(getattr(moves, name)[a:b] for name in Moves.__dataclass_fields__)), [limits]
-        )
-        for a, b in pairwise(edges)
-    ]
+    parts = [planner.push_moves(rows_of(moves, slice(a, b)), [limits]) for a, b in pairwise(edges)]
     return join_phases([*parts, planner.flush()])
 
 
 def lasts(phases: Phases) -> np.ndarray:
-    return phases.accel_s + phases.cruise_s + phases.decel_s
+    return phases.lasts_s
 
 
 def test_a_move_from_rest_to_rest() -> None:
@@ -215,7 +210,7 @@ def test_moves_of_a_million_years_are_planned(speed: float) -> None:
     """The clock of the plan goes on where its numbers are too large for a nanosecond."""
     limits = replace(LIMITS, speed_x_mm_s=speed, min_speed_mm_s=0.0)
     phases = plan(path([(7.3 * (k % 5), 0.1 * k) for k in range(90)], 60.0), limits)
-    lasts_s = phases.accel_s + phases.cruise_s + phases.decel_s
+    lasts_s = phases.lasts_s
     assert lasts_s.sum() == pytest.approx(phases.cruise_s.sum(), rel=1e-2)
     assert lasts_s.max() > 29.0 / speed
 

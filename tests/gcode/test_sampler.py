@@ -11,15 +11,15 @@ from hypothesis import strategies as st
 
 from stillpath.gcode.firmware.klipper.planner import Planner
 from stillpath.gcode.firmware.planning import join_phases
-from stillpath.gcode.interpreter import interpret_bytes
 from stillpath.gcode.sampler import Sampler, Samples, distances, sample_phases, sample_until
-from stillpath.gcode.types import Phases
+from stillpath.gcode.types import Phases, rows_of
 from stillpath.models.machine import Machine
+from tests.gcode.cutting import blocks_of
 
 
 def plan_of(text: str, machine: Machine) -> Phases:
     planner = Planner(machine.firmware)
-    parts = [planner.push(block) for block in interpret_bytes(text.encode(), machine)]
+    parts = [planner.push(block) for block in blocks_of(text.encode(), machine)]
     return join_phases([*parts, planner.flush()])
 
 
@@ -102,7 +102,7 @@ def test_streaming_has_no_gap(plan: Phases, cuts: list[int], dt_s: float) -> Non
     bounds = [0, *sorted(min(cut, len(plan)) for cut in cuts), len(plan)]
     parts: list[Samples] = []
     for a, b in pairwise(bounds):
-        part = Phases(*(getattr(plan, name)[a:b] for name in Phases.__dataclass_fields__))
+        part = rows_of(plan, slice(a, b))
         parts += sampler.push(part)
     parts += sampler.flush()
     t_s = np.concatenate([part.t_s for part in parts])
@@ -119,7 +119,7 @@ def test_streaming_has_no_gap(plan: Phases, cuts: list[int], dt_s: float) -> Non
 
 
 def test_refused(plan: Phases) -> None:
-    none = Phases(*(getattr(plan, name)[:0] for name in Phases.__dataclass_fields__))
+    none = rows_of(plan, slice(0))
     with pytest.raises(ValueError, match="no phases"):
         sample_phases(none, (0.0, 1.0, 1))
     with pytest.raises(ValueError, match="no phases"):

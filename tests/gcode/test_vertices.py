@@ -15,20 +15,20 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from stillpath.gcode.firmware import _vertex_kernels as kernels
-from stillpath.gcode.firmware.vertices import Lattice, _Answers, vertices_on_steps
+from stillpath.gcode.firmware.vertices import Lattice, _answer_of, vertices_on_steps
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.segments import ErrorFilter, Segments
 from stillpath.gcode.timeline import Timeline
 from stillpath.gcode.types import ProgramBlock
 from stillpath.models.firmware import Marlin
-from stillpath.models.firmware.marlin import MarlinPlanner, PerAxis
+from stillpath.models.firmware.marlin import PerAxis
 from stillpath.models.machine import Machine
 from stillpath.models.plants import plant_set
 from stillpath.models.store import load_machine
 from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.options import Options
 from stillpath.simulation.response import response
-from tests.gcode.cutting import HEAD
+from tests.gcode.cutting import HEAD, MARLIN_PLANNER
 from tests.gcode.prints import polygon
 
 DT_S = 1e-3
@@ -238,28 +238,11 @@ def test_the_choice_is_nearly_the_best_of_all() -> None:
             beside = [(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)]
             place[k, : count[k]] = nearest + np.array(beside[: count[k]])
             place_at[k, : count[k]] = at[k] + rng.uniform(-0.5, 0.5, count[k]) * (0 < k < n - 1)
-        answers, chosen = _Answers.of(SOFT), np.zeros(n, np.int64)
-        slow, z = np.ones(n, np.bool_), np.zeros(n, np.int64)
-        assert kernels.choose_vertices(
-            place,
-            place_at,
-            count,
-            slow,
-            z,
-            command,
-            heading,
-            6,
-            np.ones(2),
-            np.full(2, np.inf),
-            1.0,
-            np.array([1e9, 1e9, np.inf]),
-            False,
-            answers.pole,
-            answers.weight,
-            answers.direct,
-            answers.energy,
-            chosen,
-        )
+        chosen, z = np.zeros(n, np.int64), np.zeros(n, np.int64)
+        places = kernels.Places(place, place_at, count, np.ones(n, np.bool_))
+        bend = np.array([1e9, 1e9, np.inf])
+        rules = kernels.Rules(6, np.ones(2), np.full(2, np.inf), 1.0, bend, False)
+        assert kernels.choose_vertices(places, z, command, heading, rules, _answer_of(SOFT), chosen)
 
         def cost(
             which: tuple[int, ...],
@@ -289,13 +272,7 @@ def test_the_choice_is_nearly_the_best_of_all() -> None:
 def test_a_stock_printer_executes_every_move_of_a_stream(tmp_path: Path, cache: Path) -> None:
     firmware = Marlin(
         steps_per_mm=PerAxis(x=80.0, y=80.0, z=400.0, e=93.0),
-        planner=MarlinPlanner(
-            max_accel_mm_s2=PerAxis(x=3000.0, y=3000.0, z=200.0, e=5000.0),
-            max_feedrate_mm_s=PerAxis(x=500.0, y=500.0, z=20.0, e=100.0),
-            accel_mm_s2=2000.0,
-            travel_accel_mm_s2=2000.0,
-            junction_deviation_mm=0.02,
-        ),
+        planner=MARLIN_PLANNER,
         home_mm=(0.0, 0.0, 0.0),
     )
     machine = load_machine("ender3").model_copy(update={"firmware": firmware})

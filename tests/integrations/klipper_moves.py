@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from stillpath.gcode.firmware.planning import join_phases
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.types import Phases
@@ -153,9 +154,7 @@ def read_back(text: str, machine: Machine) -> Phases:
     """Interpret and plan a text as Stillpath does."""
     reader, planner = Interpreter(machine), adapter(machine).planner()
     parts = [planner.push(block) for block in (*reader.push(text.encode()), *reader.flush())]
-    parts.append(planner.flush())
-    names = Phases.__dataclass_fields__
-    return Phases(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in names})
+    return join_phases([*parts, planner.flush()])
 
 
 _PLACES = {

@@ -13,8 +13,9 @@ from stillpath.applications.proof.motor_test import borne, levels_of, motor_test
 from stillpath.models.firmware.klipper import FirmwareShaper
 from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine
-from stillpath.pipeline.compensate import compensate_file, plan_file
+from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.options import Options
+from stillpath.pipeline.simulate import plan_file
 from tests.integrations.interrupted import (
     EVENTS,
     ONCE,

@@ -25,9 +25,10 @@ from stillpath.models.store import load_machine
 from stillpath.pipeline.advising.choosing import ladder
 from stillpath.pipeline.advising.inserting import MARK
 from stillpath.pipeline.advising.removing import remove_advice
-from stillpath.pipeline.compensate import compensate_file, simulate_file
+from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.result import Result
+from stillpath.pipeline.simulate import simulate_file
 from tests.gcode.container_files import binary
 from tests.gcode.prints import polygon
 

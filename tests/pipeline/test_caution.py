@@ -82,7 +82,7 @@ def test_no_member_fares_worse_than_with_the_shaper(name: str, cache: Path) -> N
     machine = load_machine(name)
     best = cached_shaper(machine, cache)
     options = Options()
-    assert design_mode(machine, options) == "ensemble"
+    assert design_mode(machine) == "ensemble"
     chosen = caution_for(machine, options, best, cache, DT_S)
     assert chosen is not None
     caution, choice = chosen
@@ -172,7 +172,7 @@ def test_of_a_resonance_that_was_typed_in_the_shaper_is_made(tmp_path: Path) -> 
 
 def test_nobody_is_cautious_without_a_measured_set(tmp_path: Path) -> None:
     machine = nobody_said_how(load_machine("generic-corexy"))
-    assert design_mode(machine, Options()) == "off"
+    assert design_mode(machine) == "off"
     for options in (Options(), Options(robust="off"), Options(method="shaper:mzv")):
         assert caution_for(machine, options, shaper(45.0), tmp_path, DT_S) is None
     measured = machine_of(45.0, 40.0)

@@ -22,7 +22,7 @@ from stillpath.models.machine import AxisTravel, Machine
 from stillpath.models.plants import plant_set
 from stillpath.models.reference_motion import reference_motion
 from stillpath.models.store import load_machine
-from stillpath.pipeline.compensate import compensate_file, plan_file
+from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.last_check.errors import LastCheckError
 from stillpath.pipeline.measuring.measure import STRIDE, Measurement
 from stillpath.pipeline.measuring.points import MotionSamples
@@ -31,6 +31,7 @@ from stillpath.pipeline.options import Options
 from stillpath.pipeline.piece_compensator import PieceCompensator, Unfit
 from stillpath.pipeline.progress import Cancelled, Progress
 from stillpath.pipeline.result import ErrorFigures, Result
+from stillpath.pipeline.simulate import plan_file
 from stillpath.simulation.measures import contour_error
 from stillpath.simulation.response import response
 from tests.gcode.cutting import HEAD, pieces_of

@@ -11,9 +11,10 @@ from stillpath.cli.main import run
 from stillpath.gcode.containers.opening import open_text
 from stillpath.gcode.errors import GcodeError
 from stillpath.models.store import load_machine
-from stillpath.pipeline.compensate import compensate_file, plan_file, simulate_file
+from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.progress import Cancelled, Progress
+from stillpath.pipeline.simulate import plan_file, simulate_file
 from tests.gcode.container_files import binary, blocks, members, package
 from tests.gcode.cutting import HEAD
 from tests.gcode.prints import polygon

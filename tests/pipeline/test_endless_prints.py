@@ -8,9 +8,10 @@ import pytest
 
 from stillpath.gcode.errors import GcodeError
 from stillpath.models.store import load_machine
-from stillpath.pipeline.compensate import compensate_file, plan_file, simulate_file
+from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.progress import Progress, ProgressCallback
+from stillpath.pipeline.simulate import plan_file, simulate_file
 from tests.gcode.cutting import HEAD
 
 MOVES = "G1 X120 E1 F6000\nG1 X60 E1\n"

@@ -11,9 +11,10 @@ import pytest
 from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine
-from stillpath.pipeline.compensate import compensate_file, plan_file, simulate_file
+from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.measuring.reference_shaper import cached_shaper
 from stillpath.pipeline.options import Options
+from stillpath.pipeline.simulate import plan_file, simulate_file
 from tests.gcode.prints import polygon
 from tests.gcode.states import differences, tagged
 

@@ -15,15 +15,16 @@ from scipy import signal
 
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.encoding import as_moves
-from stillpath.gcode.types import Moves
+from stillpath.gcode.types import Moves, rows_of
 from stillpath.models.machine import Machine
 from stillpath.models.plants import PlantSetSpec
 from stillpath.models.store import load_machine
-from stillpath.pipeline.compensate import compensate_file, plan_file, simulate_file
+from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.measuring import _layer_kernels as kernels
 from stillpath.pipeline.measuring import layers as layers_module
 from stillpath.pipeline.measuring.layers import UNKNOWN, LayerRecorder, LayerTile
 from stillpath.pipeline.options import Options
+from stillpath.pipeline.simulate import plan_file, simulate_file
 from tests.gcode.cutting import HEAD
 from tests.gcode.prints import polygon
 from tests.pipeline.tiles import read_tiles
@@ -269,7 +270,7 @@ def recorded(
     xy, z, extruding, row, error = samples
     edges = [0, *parts, len(moves)]
     for first, last in pairwise(edges):
-        table = Moves(**{n: getattr(moves, n)[first:last] for n in Moves.__dataclass_fields__})
+        table = rows_of(moves, slice(first, last))
         mine = np.flatnonzero((row >= first) & (row < last))
         if len(mine) == 0:
             continue

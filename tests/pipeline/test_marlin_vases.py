@@ -17,11 +17,6 @@ from tests.gcode.prints import vase
 Z_STEPS_PER_MM = 400.0
 
 
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("cache")
-
-
 @pytest.mark.parametrize("junction", ["deviation", "classic_jerk"])
 @pytest.mark.parametrize("speed_mm_s", [60.0, 80.0])
 @pytest.mark.parametrize("turns", [2, -2])

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from stillpath.compensation.shapers import shape, shaper_pulses
-from stillpath.gcode.interpreter import interpret_bytes
 from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine
 from stillpath.pipeline.measuring.points import MotionSamples
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.pipeline.measuring.responses import Responses, ResponseSamples
 from stillpath.simulation.scheduled import MachineStream
+from tests.gcode.cutting import blocks_of
 
 DT_S = 1e-3
 SHAPER = BestShaper("mzv", 45.3, 38.1, 0.1, contour_rms_um=0.0, tracking_rms_um=0.0)
@@ -35,7 +35,7 @@ def walk(seed: int, count: int) -> np.ndarray:
 def pushed(
     answers: Responses, path: np.ndarray, executed: np.ndarray
 ) -> Iterator[ResponseSamples | None]:
-    moves = interpret_bytes(b"G28\nG1 X1\n", load_machine("ender3"))[0].moves
+    moves = blocks_of(b"G28\nG1 X1\n", load_machine("ender3"))[0].moves
     count = path.shape[1]
     for part in np.split(np.arange(count), [7, 300, 5000, 9100, 9101]):
         zeros = np.zeros(len(part))

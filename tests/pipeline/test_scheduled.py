@@ -19,10 +19,11 @@ from stillpath.models.provenance import Provenance
 from stillpath.models.schedule import AxisSchedule, GridNode, GridSchedule, MassSchedule
 from stillpath.models.store import load_machine
 from stillpath.pipeline.band import NOTABLE_UM, BandContent
-from stillpath.pipeline.compensate import compensate_file, simulate_file
+from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.operating_point import Operation
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.result import Result
+from stillpath.pipeline.simulate import simulate_file
 
 ROOT = Path(__file__).resolve().parents[2]
 KG_PER_MM = 1e-6 * 1.24 * 0.25 * math.pi * 1.75**2

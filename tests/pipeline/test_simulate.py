@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 
 from stillpath.models.store import load_machine
-from stillpath.pipeline.compensate import compensate_file, simulate_file
+from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.options import Options
+from stillpath.pipeline.simulate import simulate_file
 from tests.gcode.cutting import HEAD
 
 LINES = "G1 X20 Y20 F6000\nG1 X100 Y20 E5 F3000\nG1 X100 Y60 E2\n"

@@ -7,9 +7,10 @@ from pathlib import Path
 import pytest
 
 from stillpath.models.store import load_machine
-from stillpath.pipeline.compensate import compensate_file, plan_file, simulate_file
+from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.result import Result
+from stillpath.pipeline.simulate import plan_file, simulate_file
 from tests.gcode.cutting import HEAD
 from tests.gcode.prints import polygon
 

@@ -13,8 +13,9 @@ from stillpath.cli.main import run
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.writing import StreamWriter
 from stillpath.models.store import load_machine
-from stillpath.pipeline.compensate import compensate_file, plan_file
+from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.options import Options
+from stillpath.pipeline.simulate import plan_file
 from stillpath.pipeline.trajectories import TrajectoryFormat, write_trajectories
 from stillpath.simulation.measures import contour_error
 from tests.gcode.cutting import HEAD

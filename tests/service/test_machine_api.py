@@ -235,8 +235,6 @@ def test_the_age_of_a_measurement_reaches_the_report(tmp_path: Path):
     old = make_plants(50.0, on=date(2020, 1, 31))
     store.add_revision("mine", make_machine(axes={"x": old, "y": make_plants()}), author="anna")
     task = Task(
-        job_id="a" * 32,
-        attempt=1,
         machine="mine",
         machine_file=tmp_path / "machine.json",
         options={"method": "none"},

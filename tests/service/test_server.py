@@ -7,8 +7,7 @@ import os
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,8 @@ from typing import Any
 import httpx2
 import psutil
 import pytest
+
+from tests.service.jobs.site import until
 
 ROOT = Path(__file__).resolve().parents[2]
 PRETEND = [sys.executable, str(Path(__file__).with_name("pretend_server.py"))]
@@ -56,16 +57,6 @@ def _answers(client: httpx2.Client) -> bool:
         return client.get("/readyz").status_code == 200
     except httpx2.TransportError:
         return False
-
-
-def until(wanted: Callable[[], Any], seconds: float = 300.0) -> Any:
-    deadline = time.monotonic() + seconds
-    while time.monotonic() < deadline:
-        found = wanted()
-        if found:
-            return found
-        time.sleep(0.05)
-    raise AssertionError("waited in vain")
 
 
 def finished(client: httpx2.Client, where: str, seconds: float = 300.0) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from stillpath.gcode.firmware._encoding_kernels import MoveLimits
 from stillpath.gcode.firmware._writing_kernels import printed_feedrate
 from stillpath.models.jit import kernel
 
@@ -26,17 +27,15 @@ _SETTLED_MM_S = 1e-4
 def expected_braking(
     ours: NDArray[np.bool_],
     stops: NDArray[np.bool_],
-    length_mm: NDArray[np.float64],
+    allowed: MoveLimits,
     planned_s: NDArray[np.float64],
-    speed_mm_s: NDArray[np.float64],
-    accel_mm_s2: NDArray[np.float64],
-    junction_mm_s: NDArray[np.float64],
     braking_s: NDArray[np.float64],
 ) -> None:
     """Find what is lost by braking at the end of every segment of ours if all keep their times.
 
     See `assign_speeds`; `braking_s` is what it starts from.
     """
+    length_mm, accel_mm_s2, speed_mm_s, junction_mm_s = allowed
     count = len(length_mm)
     for i in range(count):
         braking_s[i] = 0.0
@@ -57,12 +56,9 @@ def expected_braking(
 def assign_speeds(
     ours: NDArray[np.bool_],
     stops: NDArray[np.bool_],
-    length_mm: NDArray[np.float64],
+    allowed: MoveLimits,
     end_s: NDArray[np.float64],
     planned_s: NDArray[np.float64],
-    speed_mm_s: NDArray[np.float64],
-    accel_mm_s2: NDArray[np.float64],
-    junction_mm_s: NDArray[np.float64],
     correction_s: NDArray[np.float64],
     start_s: float,
     braking_s: NDArray[np.float64],
@@ -72,8 +68,8 @@ def assign_speeds(
     """Feedrates (mm/min, as they will be printed) that reach every end at its time.
 
     Moves with `ours` false have their own speed, moves with `stops` true (extruder alone) start
-    and end at rest. `speed_mm_s` is the speed of a foreign move and the highest one of ours;
-    `junction_mm_s[i]` limits the speed between i - 1 and i.
+    and end at rest. `allowed.speed_mm_s` is the speed of a foreign move and the highest one of
+    ours.
 
     The time still to spend is the target minus the time predicted so far. Klipper loses
     (v1 - v2)^2 / (2 a v) at a step between speeds v1 and v2; that loss is taken off first. What
@@ -82,6 +78,7 @@ def assign_speeds(
     before it is over: its times move with that. Where a segment cannot keep its time, what is owed
     is made up for by those after it, little by little.
     """
+    length_mm, accel_mm_s2, speed_mm_s, junction_mm_s = allowed
     now = start_s
     before = 0.0
     before_accel = 1.0

@@ -5,6 +5,7 @@ from __future__ import annotations
 from math import inf, sqrt
 from typing import Any
 
+from stillpath.gcode.firmware._encoding_kernels import MoveLimits
 from stillpath.models.jit import kernel
 
 __all__ = ["move_limits"]
@@ -17,13 +18,10 @@ def move_limits(
     limits_id: Any,
     limits: Any,
     facts: Any,
-    length: Any,
-    accel: Any,
-    speed: Any,
-    junction: Any,
+    allowed: MoveLimits,
     stops: Any,
 ) -> None:
-    """Fill length, acceleration, highest speed and junction limit of every move.
+    """Find what is allowed to every move.
 
     Rules: klippy/toolhead.py, klippy/kinematics/extruder.py, 2026-08.
 
@@ -34,11 +32,12 @@ def move_limits(
         Velocity, acceleration, square corner velocity and minimum cruise ratio of a `limits_id`.
     facts : tuple of float
         Speed and acceleration of Z, of the extruder alone, and its instantaneous corner velocity.
-    length, accel, speed, junction : ndarray, shape (n,)
-        The junction limit holds where the move begins.
+    allowed : MoveLimits
+        Filled.
     stops : ndarray of bool, shape (n,)
-        Moves of the extruder alone.
+        Filled: moves of the extruder alone.
     """
+    length, accel, speed, junction = allowed
     z_speed, z_accel, e_speed, e_accel, e_corner = facts
     x0 = y0 = z0 = ratio0 = corner0 = 0.0
     for i in range(len(length)):

@@ -6,7 +6,7 @@ Sources: klippy/extras/gcode_move.py, firmware_retraction.py, exclude_object.py,
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -27,26 +27,28 @@ __all__ = [
     "velocity_limit",
 ]
 
-_LIMITS = {
-    "VELOCITY": "velocity_mm_s",
-    "ACCEL": "accel_mm_s2",
-    "SQUARE_CORNER_VELOCITY": "square_corner_velocity_mm_s",
-    "MINIMUM_CRUISE_RATIO": "minimum_cruise_ratio",
+_LIMITS: dict[str, tuple[str, Callable[[float], bool], str]] = {
+    "VELOCITY": ("velocity_mm_s", lambda v: v > 0.0, "above 0"),
+    "ACCEL": ("accel_mm_s2", lambda v: v > 0.0, "above 0"),
+    "SQUARE_CORNER_VELOCITY": ("square_corner_velocity_mm_s", lambda v: v >= 0.0, "at least 0"),
+    "MINIMUM_CRUISE_RATIO": (
+        "minimum_cruise_ratio",
+        lambda v: 0.0 <= v < 1.0,
+        "at least 0 and below 1",
+    ),
 }
+"""Parameters of SET_VELOCITY_LIMIT: what they set, which values are allowed, and that in words."""
 
 
 def velocity_limit(state: MachineState, command: Command) -> int:
     """SET_VELOCITY_LIMIT."""
     given = state.extended(command)
     values = {}
-    for k, (key, field) in enumerate(_LIMITS.items()):
-        if key not in given:
-            continue
-        value = state.number(given[key], key, command)
-        low = "above 0" if k < 2 else "at least 0" if k == 2 else "at least 0 and below 1"
-        if value < 0 or (k < 2 and value == 0) or (k == 3 and value >= 1):
-            raise state.problem(f"{key}={given[key]} must be {low}", command)
-        values[field] = value
+    for key, (field, allows, allowed) in _LIMITS.items():
+        if key in given:
+            values[field] = state.number(given[key], key, command)
+            if not allows(values[field]):
+                raise state.problem(f"{key}={given[key]} must be {allowed}", command)
     return state.set_limits(command, values)
 
 

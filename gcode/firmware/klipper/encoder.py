@@ -14,6 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from stillpath.gcode.firmware._encoding_kernels import MoveLimits
 from stillpath.gcode.firmware.base import square_corner_mm_s
 from stillpath.gcode.firmware.encoding import (
     UNITS_PER_MM,
@@ -119,21 +120,20 @@ class KlipperEncoder:
         start_mm, end_mm = places_mm[:-1], places_mm[1:]
         ours = rows < 0
         limits_id, limits = limits_in_force(piece, rows, [self._limits], np.zeros_like(rows))
-        length, accel, limit, junction, stops = self._motion(start_mm, end_mm, limits_id, limits)
-        speed = np.where(ours, limit, np.minimum(limit, piece.moves.speed_mm_s[rows]))
+        allowed, stops = self._allowed(start_mm, end_mm, limits_id, limits)
+        asked = np.where(ours, np.inf, piece.moves.speed_mm_s[rows])
+        speed = np.minimum(allowed.speed_mm_s, asked)
+        allowed = allowed._replace(speed_mm_s=speed)
 
         correction, braking, feedrate, predicted = np.zeros((4, len(rows)))
-        expected_braking(ours, stops, length, moves.planned_s, speed, accel, junction, braking)
+        expected_braking(ours, stops, allowed, moves.planned_s, braking)
         for _ in range(_PASSES):
             assign_speeds(
                 ours,
                 stops,
-                length,
+                allowed,
                 moves.end_s,
                 moves.planned_s,
-                speed,
-                accel,
-                junction,
                 correction,
                 float(timeline.start_s[0]),
                 braking,
@@ -149,20 +149,14 @@ class KlipperEncoder:
             correction += miss
         return encoded_piece(timeline, moves, self._limits, feedrate, phases)
 
-    def _motion(
+    def _allowed(
         self,
         start_mm: NDArray[np.float64],
         end_mm: NDArray[np.float64],
         limits_id: NDArray[np.int32],
         limits: Sequence[Limits],
-    ) -> tuple[
-        NDArray[np.float64],
-        NDArray[np.float64],
-        NDArray[np.float64],
-        NDArray[np.float64],
-        NDArray[np.bool_],
-    ]:
-        """Length, acceleration, speed and junction limit of every move, and which are E alone."""
+    ) -> tuple[MoveLimits, NDArray[np.bool_]]:
+        """Return what is allowed to every move, and which are of the extruder alone."""
         planner, extruder = self._firmware.planner, self._firmware.extruder
         facts = (
             planner.max_z_velocity_mm_s,
@@ -171,10 +165,7 @@ class KlipperEncoder:
             extruder.max_extrude_only_accel_mm_s2,
             extruder.instantaneous_corner_velocity_mm_s,
         )
-        length, accel, speed, junction = np.empty((4, len(limits_id)))
-        stops = np.empty(len(limits_id), bool)
+        allowed, stops = MoveLimits(*np.empty((4, len(limits_id)))), np.empty(len(limits_id), bool)
         table = np.array([one.as_row() for one in limits])
-        move_limits(
-            start_mm, end_mm, limits_id, table, facts, length, accel, speed, junction, stops
-        )
-        return length, accel, speed, junction, stops
+        move_limits(start_mm, end_mm, limits_id, table, facts, allowed, stops)
+        return allowed, stops

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stillpath.gcode.firmware._vertex_kernels import hop
 from stillpath.gcode.firmware._writing_kernels import printed_feedrate
 from stillpath.models.jit import kernel
 
-__all__ = ["assign_rates", "bend_reversals", "spread_advance", "thin"]
+__all__ = ["Blocks", "assign_rates", "bend_reversals", "spread_advance", "thin"]
+
+Array = NDArray[np.float64]
 
 RUSH, RUSH_MM_S = 1.25, 10.0
 """No segment is hurried beyond this much of its planned speed and this much more: what is lost at
@@ -182,57 +185,67 @@ def _hop(a: Any, b: Any, corexy: bool) -> Any:
     return hop(a[0] - b[0], a[1] - b[1], a[2] - b[2], corexy)
 
 
-@kernel(inline=True)
-def _last_rate(rate: float, per_mm: float, v_next: float, accel: float) -> float:
-    """Rate of a block's last step in bugfix: braked for half a step, not below the next speed."""
-    return max(rate - 0.5 * accel * per_mm / rate, min(v_next * per_mm, rate))
+class Blocks(NamedTuple):
+    """Moves as the planner makes blocks of them; arrays of shape (n,).
+
+    Attributes
+    ----------
+    ours : ndarray of bool
+        Segments of the stream; the others are the rests' own moves.
+    steps, path_mm : ndarray
+        Step events and length; 0 steps: the firmware swallows the move.
+    end_s, planned_s : ndarray
+        When a segment is to end, and how long it is to last.
+    fastest_mm_s : ndarray
+    """
+
+    ours: NDArray[np.bool_]
+    steps: Array
+    path_mm: Array
+    end_s: Array
+    planned_s: Array
+    fastest_mm_s: Array
 
 
 @kernel
 def assign_rates(
-    ours: Any,
-    steps: Any,
-    path_mm: Any,
-    end_s: Any,
-    planned_s: Any,
-    fastest_mm_s: Any,
-    foreign_s: Any,
-    correction_s: Any,
-    floor_mm_s: Any,
-    accel_mm_s2: float,
-    bugfix: bool,
+    blocks: Blocks,
+    foreign_s: Array,
+    correction_s: Array,
     instant: bool,
     timer_hz: float,
     least_hz: float,
     start_s: float,
-    feedrate: Any,
-    predicted_s: Any,
+    feedrate: Array,
+    predicted_s: Array,
 ) -> None:
     """Feedrates (mm/min, as they will be printed) that reach every end at its time.
 
-    The firmware rounds the step rate up and the time of a step down to ticks; a block that starts
-    at the slower speed of the one before (releases with junction deviation) or ends at that of
-    the next (bugfix) loses part of a step. What is lost or won is carried to the next segment.
+    The firmware rounds the step rate up and the time of a step down to ticks; with junction
+    deviation a block that starts at the slower speed of the one before loses part of a step. What
+    is lost or won is carried to the next segment.
 
     Parameters
     ----------
-    steps, path_mm : ndarray, shape (n,)
-        Step events and length of every block; 0 steps: the firmware swallows the move.
+    blocks : Blocks
     foreign_s : ndarray, shape (n,)
         How long moves that are not ours take.
     correction_s : ndarray, shape (n,)
         What a block takes longer than this law says.
-    floor_mm_s : ndarray, shape (n,)
-        Speed from which bugfix starts and stops at once.
     instant : bool
-        Every block starts at its own speed (classic jerk of the releases).
+        Every block starts at its own speed (classic jerk).
+    timer_hz : float
+        Of the step timer.
     least_hz : float
         The slowest step rate that there is: what a creep or a stand would take longer is carried,
         too.
+    start_s : float
+    feedrate, predicted_s : ndarray, shape (n,)
+        Filled.
     """
+    ours, steps, path_mm, end_s, planned_s, fastest_mm_s = blocks
     now = start_s
     before = 0.0
-    before_steps_per_mm = 1.0
     late = 0.0
     for i in range(len(steps)):
         if not ours[i]:
@@ -258,17 +271,13 @@ def assign_rates(
         hurried = RUSH * path / planned_s[i] + RUSH_MM_S
         least = path / min(fastest_mm_s[i], hurried)
         available = max(wanted, least)
-        # The next one may begin (releases) or this one end (bugfix) at the slower of both speeds:
-        # the share of a step that this takes is time that the rest of this block does not have.
+        # The next one may begin at this one's slower speed: the share of a step that this takes is
+        # time that the rest of this block does not have.
         slow_steps, slow_s = 0.0, 0.0
         if not instant and i + 1 < len(steps) and ours[i + 1] and steps[i + 1] > 0.0:
             v_next = path_mm[i + 1] / planned_s[i + 1]
             next_per_mm = steps[i + 1] / path_mm[i + 1]
-            if bugfix:
-                slowest = _last_rate(n / available, per_mm, v_next, accel_mm_s2)
-                if slowest * available < n and n > 1.0:
-                    slow_steps, slow_s = -1.0, -1.0 / slowest
-            elif v_next * available > path:
+            if v_next * available > path:
                 slow_steps, slow_s = per_mm / next_per_mm, 1.0 / (v_next * next_per_mm)
         rate = n / available
         ticks = 0.0
@@ -284,8 +293,6 @@ def assign_rates(
             rate = min(max(np.ceil(n / free), lowest), highest)
             lost = 0.0
             entry = min(before, rate / per_mm)
-            if bugfix:
-                entry = max(entry, min(floor_mm_s[i], rate / per_mm))
             if not instant and entry > 0.0 and entry * per_mm < rate - 1.0:
                 lost = np.floor(timer_hz / np.ceil(entry * per_mm)) / timer_hz - ticks / timer_hz
         # Half a step per second below: the firmware rounds up.
@@ -296,11 +303,4 @@ def assign_rates(
         now += predicted_s[i]
         if first:
             late += predicted_s[i] - planned_s[i]
-        v = rate / per_mm
-        if bugfix and i > 0 and ours[i - 1] and steps[i - 1] > 1.0 and before > v:
-            was = before * before_steps_per_mm
-            slowest = _last_rate(was, before_steps_per_mm, v, accel_mm_s2)
-            predicted_s[i - 1] += 1.0 / slowest - 1.0 / was
-            now += 1.0 / slowest - 1.0 / was
-        before = v
-        before_steps_per_mm = per_mm
+        before = rate / per_mm

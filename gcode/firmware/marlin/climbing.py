@@ -58,16 +58,14 @@ def climb_in_long_moves(
     else:
         least_s = (_SHARE / (per_mm * limits.accel_z_mm_s2) ** 0.5,) * 2
     z_mm, keep = segments.end_mm[2].copy(), np.ones(len(segments), np.bool_)
-    firsts = np.flatnonzero(np.append(True, segments.group[1:] != segments.group[:-1]))
-    for first, stop in pairwise((*firsts.tolist(), len(segments))):
-        group = int(segments.group[first])
-        takes_s = np.diff(np.append(timeline.start_s[group], segments.end_s[first:stop]))
-        wish = per_mm * np.append(timeline.group_start_mm[group, 2], z_mm[first:stop])
+    for group, rows in segments.stretches():
+        takes_s = np.diff(np.append(timeline.start_s[group], segments.end_s[rows]))
+        wish = per_mm * np.append(timeline.group_start_mm[group, 2], z_mm[rows])
         up = 1.0 if wish[-1] >= wish[0] else -1.0
         climbs = _climbs(up * wish, takes_s)
         if climbs is not None:
-            z_mm[first : stop - 1] = (np.round(wish[0]) + up * np.cumsum(climbs)[:-1]) / per_mm
-            keep[first:stop] = _joined(climbs, takes_s, *least_s)
+            z_mm[rows][:-1] = (np.round(wish[0]) + up * np.cumsum(climbs)[:-1]) / per_mm
+            keep[rows] = _joined(climbs, takes_s, *least_s)
     end_mm = np.vstack([segments.end_mm[:2], z_mm, segments.end_mm[3]])
     return Segments(segments.end_s[keep], end_mm[:, keep], segments.group[keep])
 

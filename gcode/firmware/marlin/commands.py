@@ -18,12 +18,13 @@ from stillpath.gcode.types import EventKind
 from stillpath.models.firmware import Marlin
 
 __all__ = [
+    "accelerations",
     "axis_limits",
+    "corners_and_least_speeds",
     "end_motion_mode",
     "extrude_factor",
     "filament_area",
     "linear_advance",
-    "motion_limits",
     "park_tool",
     "reset_limits",
     "reset_origin",
@@ -69,20 +70,24 @@ def axis_limits(fields: str) -> Handler:
     return handle
 
 
-def motion_limits(state: MachineState, command: Command) -> int:
-    """M204, and M205 with J or X Y Z E, whichever the firmware is built for."""
+def accelerations(state: MachineState, command: Command) -> int:
+    """M204: P of moves that print, R of retractions, T of travel, S of P and T."""
     unit = float(state.f[at.F_UNIT_MM])
     values: dict[str, float] = {}
-    if command.name == "M204":
-        given = state.numbers(command, "SPRT")
-        for letter, value in given.items():
-            if value <= 0.0:
-                state.warn(f"M204 {letter}{value:g} is not above 0 and is passed over")
-            elif letter == "S":
-                values[_M204["P"]] = values[_M204["T"]] = value * unit
-            else:
-                values[_M204[letter]] = value * unit
-        return state.set_limits(command, values)
+    for letter, value in state.numbers(command, "SPRT").items():
+        if value <= 0.0:
+            state.warn(f"M204 {letter}{value:g} is not above 0 and is passed over")
+        elif letter == "S":
+            values[_M204["P"]] = values[_M204["T"]] = value * unit
+        else:
+            values[_M204[letter]] = value * unit
+    return state.set_limits(command, values)
+
+
+def corners_and_least_speeds(state: MachineState, command: Command) -> int:
+    """M205 with J or X Y Z E, whichever the firmware is built for."""
+    unit = float(state.f[at.F_UNIT_MM])
+    values: dict[str, float] = {}
     firmware = state.machine.firmware
     classic = isinstance(firmware, Marlin) and firmware.junction == "classic_jerk"
     for letter, value in state.numbers(command, "BSTXYZE" if classic else "BSTJ").items():

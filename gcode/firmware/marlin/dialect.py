@@ -82,8 +82,8 @@ RETRACTION: dict[str, Word] = {
 LIMITS: dict[str, Word] = {
     "M201": commands.axis_limits("accel_{axis}_mm_s2"),
     "M203": commands.axis_limits("feedrate_{axis}_mm_s"),
-    "M204": commands.motion_limits,
-    "M205": commands.motion_limits,
+    "M204": commands.accelerations,
+    "M205": commands.corners_and_least_speeds,
     "M900": commands.linear_advance,
 }
 

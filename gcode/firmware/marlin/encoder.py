@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillpath.gcode.errors import GcodeError
-from stillpath.gcode.firmware.advance import feed_at_ends, final_segments
+from stillpath.gcode.firmware.advance import feed_at_ends
 from stillpath.gcode.firmware.base import corner_step_mm_s, square_corner_mm_s
 from stillpath.gcode.firmware.encoding import (
     UNITS_PER_MM,
@@ -33,6 +33,7 @@ from stillpath.gcode.firmware.encoding import (
 )
 from stillpath.gcode.firmware.marlin._block_kernels import C_MIN_RATE
 from stillpath.gcode.firmware.marlin._encoder_kernels import (
+    Blocks,
     assign_rates,
     bend_reversals,
     spread_advance,
@@ -43,7 +44,7 @@ from stillpath.gcode.firmware.marlin.limits import MarlinLimits, advance_speed_m
 from stillpath.gcode.firmware.marlin.planner import Planner, planner_facts
 from stillpath.gcode.firmware.marlin.starting import StreamLevels, gentle_accel_mm_s2
 from stillpath.gcode.firmware.planning import join_phases
-from stillpath.gcode.firmware.vertices import Lattice, vertices_on_steps
+from stillpath.gcode.firmware.vertices import Lattice, steps_within, vertices_on_steps
 from stillpath.gcode.pieces import Piece
 from stillpath.gcode.segments import Segments
 from stillpath.gcode.timeline import Group, Timeline
@@ -153,7 +154,6 @@ class MarlinEncoder:
         self._fastest_mm_s = max(command.of(axis).velocity_mm_s for axis in ("x", "y"))
         self._mesh_slope = mesh_slope
         self._corexy = corexy
-        self._releases = firmware.variant in ("2.0", "2.1")
         scale = firmware.steps_per_mm
         self._scale = np.array([scale.x, scale.y, scale.z, scale.e])
         rate = firmware.max_segments_per_s
@@ -164,12 +164,11 @@ class MarlinEncoder:
         # With classic jerk a start has the jerk's speed, and no slow step.
         self._start_hz = self._least_hz if firmware.junction == "deviation" else np.inf
         self._burst = 0.5 * firmware.block_buffer_size
-        low_mm, high_mm = np.transpose(travel_mm)
+        low, high = steps_within(travel_mm, self._scale)
         self._lattice = Lattice(
             per_mm=self._scale,
-            # The ends of the travel, but for the rounding of decimals.
-            low=np.ceil(low_mm * self._scale[:2] - 1e-6).astype(np.int64),
-            high=np.floor(high_mm * self._scale[:2] + 1e-6).astype(np.int64),
+            low=low,
+            high=high,
             least=firmware.min_steps_per_segment,
             corexy=corexy,
             speed_step_mm_s=_CALM * command.speed_step_mm_s,
@@ -253,23 +252,14 @@ class MarlinEncoder:
         fastest = np.where(ours, _DIAGONAL * speed_mm_s, speed_mm_s)
         phases = self._plan(start_mm, end_mm, fastest, limits_id, limits)
         actual = phases.lasts_s
+        blocks = Blocks(ours, steps, path, moves.end_s, moves.planned_s, fastest)
         feedrate, predicted = np.zeros(len(ours)), np.zeros(len(ours))
-        accel = self._command.accel_mm_s2
-        floor_mm_s = np.sqrt(0.5 * accel * path / np.maximum(steps, 1.0))
         for attempt in range(_PASSES):
             assign_rates(
-                ours,
-                steps,
-                path,
-                moves.end_s,
-                moves.planned_s,
-                fastest,
+                blocks,
                 actual,
                 correction,
-                floor_mm_s,
-                accel,
-                self._firmware.variant == "bugfix",
-                self._releases and self._firmware.junction == "classic_jerk",
+                self._firmware.junction == "classic_jerk",
                 self._firmware.step_timer_hz,
                 self._least_hz,
                 begin_s,
@@ -318,8 +308,7 @@ class MarlinEncoder:
         begin_mm = timeline.group_start_mm[segments.group, 3]
         per_mm = self._scale[3]
         whole_mm = begin_mm + np.round((end_mm[3] + lead_mm - begin_mm) * per_mm) / per_mm
-        final = final_segments(segments)
-        end_mm[3] = np.where(final, end_mm[3], whole_mm)
+        end_mm[3] = np.where(segments.final, end_mm[3], whole_mm)
         return replace(segments, end_mm=end_mm)
 
     def _where_the_file_says(
@@ -368,12 +357,12 @@ class MarlinEncoder:
             keep,
         )
         steps, group, end_mm = steps[keep], wish.group[keep], wish.end_mm[:, keep]
-        if self._releases and self._firmware.junction == "deviation":
+        if self._firmware.junction == "deviation":
             places = end_mm[:2].T * scale[:2]
             bend_reversals(steps, begin, group, places, self._lattice.least, self._corexy)
-        last = np.append(group[1:] != group[:-1], True)
-        end_mm[:2, ~last] = (steps[~last, :2] / scale[:2]).T
         chosen = Segments(wish.end_s[keep], end_mm, group)
+        inner = ~chosen.final
+        end_mm[:2, inner] = (steps[inner, :2] / scale[:2]).T
         classic = self._firmware.junction == "classic_jerk"
         return climb_in_long_moves(chosen, timeline, scale[2], limits, classic_jerk=classic)
 

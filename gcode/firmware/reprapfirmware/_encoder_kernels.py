@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from stillpath.gcode.firmware._encoding_kernels import MoveLimits
 from stillpath.gcode.firmware._writing_kernels import printed_feedrate
 from stillpath.gcode.firmware.reprapfirmware._planner_kernels import SHORT_CLOCKS
 from stillpath.models.jit import kernel
@@ -24,12 +25,9 @@ _OVER, _UNDER = 1.05, 1.5
 @kernel
 def assign_speeds(
     ours: NDArray[np.bool_],
-    length_mm: NDArray[np.float64],
+    allowed: MoveLimits,
     end_s: NDArray[np.float64],
     planned_s: NDArray[np.float64],
-    speed_mm_s: NDArray[np.float64],
-    accel_mm_s2: NDArray[np.float64],
-    junction_mm_s: NDArray[np.float64],
     missed_s: NDArray[np.float64],
     start_s: float,
     clock_hz: float,
@@ -38,8 +36,8 @@ def assign_speeds(
 ) -> None:
     """Feedrates (mm/min, as they will be printed) that reach every end at its time.
 
-    Moves with `ours` false have their own speed. `speed_mm_s` is that, and the highest speed of
-    ours; `junction_mm_s[i]` limits the speed between i - 1 and i. How long a move takes depends on
+    Moves with `ours` false have their own speed: `allowed.speed_mm_s` is that, and the highest
+    speed of ours. How long a move takes depends on
     the speed of the next one, so it is settled together with that. A stretch starts when the rest
     before it is over: its times move with that.
 
@@ -54,6 +52,7 @@ def assign_speeds(
         Of the motors' steps. Phases last whole clocks; rounded by themselves, those of a long
         stretch would add up to some tenths of a ms.
     """
+    length_mm, accel_mm_s2, speed_mm_s, junction_mm_s = allowed
     short_s = SHORT_CLOCKS / clock_hz
     count = len(length_mm)
     begin = start_s  # of the move before

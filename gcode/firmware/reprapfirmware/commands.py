@@ -27,6 +27,7 @@ __all__ = [
     "extrude_factor",
     "heat_and_wait",
     "jerk",
+    "jerk_below_ceiling",
     "machine_mode",
     "pop_state",
     "pressure_advance",
@@ -77,23 +78,23 @@ def acceleration(state: MachineState, command: Command) -> int:
 
 
 def jerk(state: MachineState, command: Command) -> int:
-    """M566 sets jerk and its ceiling in mm/min, M205 the jerk below the ceiling in mm/s."""
+    """M566: jerk and its ceiling in mm/min, and between which moves it holds."""
     given = state.numbers(command, "XYZEP")
-    values = {}
+    values = {"jerk_policy": float(int(given.pop("P")))} if "P" in given else {}
     for letter, value in given.items():
-        if letter == "P":
-            if command.name == "M566":
-                values["jerk_policy"] = float(int(value))
-            continue
-        axis = letter.lower()
-        if command.name == "M566":
-            speed = max(value / 60.0, 0.1)
-            values[f"jerk_{axis}_mm_s"] = values[f"max_jerk_{axis}_mm_s"] = speed
-        else:
-            ceiling = state.limit(f"max_jerk_{axis}_mm_s")
-            values[f"jerk_{axis}_mm_s"] = min(max(value, 0.1), ceiling)
-    # What M205 does depends on the ceiling, so it is not remembered.
-    return state.set_limits(command, values, remember=command.name == "M566")
+        field = f"jerk_{letter.lower()}_mm_s"
+        values[field] = values[f"max_{field}"] = max(value / 60.0, 0.1)
+    return state.set_limits(command, values)
+
+
+def jerk_below_ceiling(state: MachineState, command: Command) -> int:
+    """M205: jerk in mm/s, up to the ceiling that M566 has set."""
+    values = {}
+    for letter, value in state.numbers(command, "XYZE").items():
+        field = f"jerk_{letter.lower()}_mm_s"
+        values[field] = min(max(value, 0.1), state.limit(f"max_{field}"))
+    # What it does depends on the ceiling, so it is not remembered.
+    return state.set_limits(command, values, remember=False)
 
 
 def pressure_advance(state: MachineState, command: Command) -> int:

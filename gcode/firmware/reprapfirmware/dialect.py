@@ -69,7 +69,7 @@ LIMITS: dict[str, Word] = {
     "M201": commands.accelerations,
     "M203": commands.speeds,
     "M204": commands.acceleration,
-    "M205": commands.jerk,
+    "M205": commands.jerk_below_ceiling,
     "M566": commands.jerk,
     "M572": commands.pressure_advance,
 }

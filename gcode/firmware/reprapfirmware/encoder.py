@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillpath.gcode.errors import GcodeError
-from stillpath.gcode.firmware.advance import feed_at_ends, final_segments
+from stillpath.gcode.firmware._encoding_kernels import MoveLimits
+from stillpath.gcode.firmware.advance import feed_at_ends
 from stillpath.gcode.firmware.encoding import (
     Encoded,
     as_moves,
@@ -30,7 +31,7 @@ from stillpath.gcode.firmware.encoding import (
 from stillpath.gcode.firmware.reprapfirmware._encoder_kernels import assign_speeds, keep_apart
 from stillpath.gcode.firmware.reprapfirmware.limits import RepRapLimits
 from stillpath.gcode.firmware.reprapfirmware.planner import RepRapPlanner
-from stillpath.gcode.firmware.vertices import Lattice, vertices_on_steps
+from stillpath.gcode.firmware.vertices import Lattice, steps_within, vertices_on_steps
 from stillpath.gcode.pieces import Piece
 from stillpath.gcode.segments import Segments
 from stillpath.gcode.timeline import Group, Timeline
@@ -142,12 +143,11 @@ class RepRapEncoder:
         """What so many moves must last, or the firmware freezes the next one too late."""
         self._limits = limits
         per_mm = np.array([drive.steps_per_mm for drive in firmware.drives])
-        low_mm, high_mm = np.transpose(travel_mm)
+        low, high = steps_within(travel_mm, per_mm)
         self._lattice = Lattice(
             per_mm=per_mm,
-            # The ends of the travel, but for the rounding of decimals.
-            low=np.ceil(low_mm * per_mm[:2] - 1e-6).astype(np.int64),
-            high=np.floor(high_mm * per_mm[:2] + 1e-6).astype(np.int64),
+            low=low,
+            high=high,
             least=1,
             # Jerk limits the axes of a CoreXY, too; and what steps of X and Y add to it counts.
             corexy=False,
@@ -178,10 +178,10 @@ class RepRapEncoder:
         start_mm, end_mm = places_mm[:-1], places_mm[1:]
         ours = rows < 0
         limits_id, limits = limits_in_force(piece, rows, [self._limits], np.zeros_like(rows))
-        length, accel, limit, junction = self._motion(start_mm, end_mm, limits_id, limits)
-        speed = np.where(ours, limit, np.minimum(limit, piece.moves.speed_mm_s[rows]))
-
-        foreseen = (length, moves.end_s, moves.planned_s, speed, accel, junction)
+        allowed = self._allowed(start_mm, end_mm, limits_id, limits)
+        asked = np.where(ours, np.inf, piece.moves.speed_mm_s[rows])
+        speed = np.minimum(allowed.speed_mm_s, asked)
+        foreseen = allowed._replace(speed_mm_s=speed), moves.end_s, moves.planned_s
         begin_s, clock_hz = float(timeline.start_s[0]), self._firmware.step_clock_hz
         feedrate, predicted, missed = (np.zeros(len(rows)) for _ in range(3))
         least_s = np.inf
@@ -209,7 +209,6 @@ class RepRapEncoder:
         if len(segments) < half:
             return segments
         begin_s = timeline.start_s[segments.group]
-        final = final_segments(segments)
         lasts = segments.end_s - _starts(timeline, segments)[0]
         total = np.cumsum(np.append(0.0, lasts))
         wanted_s = _SPARSE * self._half_ring_s
@@ -218,7 +217,7 @@ class RepRapEncoder:
         if not np.any(crowded):
             return segments
         keep = np.ones(len(segments), np.bool_)
-        keep_apart(segments.end_s, crowded, final, begin_s, wanted_s / half, keep)
+        keep_apart(segments.end_s, crowded, segments.final, begin_s, wanted_s / half, keep)
         return replace(
             segments,
             end_s=segments.end_s[keep],
@@ -231,7 +230,7 @@ class RepRapEncoder:
         end_mm = segments.end_mm.copy()
         rows, fed, _ = feed_at_ends(piece, timeline, segments)
         advance_s = np.array([x.pressure_advance_s for x in cast(list[RepRapLimits], piece.limits)])
-        fed = np.where(final_segments(segments), 0.0, fed)
+        fed = np.where(segments.final, 0.0, fed)
         end_mm[3] += advance_s[piece.moves.limits_id[rows]] * fed
         return replace(segments, end_mm=end_mm)
 
@@ -245,17 +244,14 @@ class RepRapEncoder:
             return segments
         return vertices_on_steps(self._lattice, timeline, segments)
 
-    def _motion(
+    def _allowed(
         self,
         start_mm: NDArray[np.float64],
         end_mm: NDArray[np.float64],
         limits_id: NDArray[np.int32],
         limits: Sequence[Limits],
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Length, acceleration, speed and junction limit of every move.
-
-        Rules: those of the planner.
-        """
+    ) -> MoveLimits:
+        """Return what is allowed to every move, by the rules of the planner."""
         own = np.array([x.as_row() for x in limits])[limits_id]
         travel = end_mm - start_mm
         length = np.sqrt(np.sum(travel[:, :3] ** 2, axis=1))
@@ -279,7 +275,7 @@ class RepRapEncoder:
         kind = xy + 2 * prints + 4 * ((travel[:, 3] != 0.0) & ~prints)
         meets = np.append(False, kind[1:] != kind[:-1])
         junction[meets & (own[:, 19] == 0.0)] = 0.0
-        return length, accel, limit, junction
+        return MoveLimits(length, accel, limit, junction)
 
     def _check_rate(self, phases: Phases, piece: Piece) -> None:
         """Refuse segments that come faster than the firmware's queue can handle."""
@@ -302,7 +298,7 @@ def _starts(
     timeline: Timeline, segments: Segments
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """When, shape (n,), and where, shape (4, n), segments begin."""
-    fresh = np.append(True, final_segments(segments)[:-1])
+    fresh = np.append(True, segments.final[:-1])
     start_s = np.where(fresh, timeline.start_s[segments.group], np.roll(segments.end_s, 1))
     start_mm = np.roll(segments.end_mm, 1, axis=1)
     start_mm[:, fresh] = timeline.group_start_mm[segments.group[fresh]].T

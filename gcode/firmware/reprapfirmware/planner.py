@@ -17,7 +17,7 @@ from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.planning import empty_phases, join_phases
 from stillpath.gcode.firmware.queueing import QueuePlanner, with_motion
 from stillpath.gcode.firmware.reprapfirmware import _planner_kernels as kernels
-from stillpath.gcode.types import Moves, Phases
+from stillpath.gcode.types import Moves, Phases, rows_of
 from stillpath.models.firmware import RepRapFirmware
 
 __all__ = ["GRACE_S", "RepRapPlanner", "on_steps"]
@@ -155,8 +155,7 @@ class RepRapPlanner(QueuePlanner):
         following = np.searchsorted(planned.move_index, rows.move_index)
         rows.t_s[:] = np.append(planned.t_s, self._time_s)[following]
         both = join_phases([planned, rows])
-        order = np.argsort(both.move_index, kind="stable")
-        return Phases(*(getattr(both, name)[order] for name in Phases.__dataclass_fields__))
+        return rows_of(both, np.argsort(both.move_index, kind="stable"))
 
 
 def on_steps(
