@@ -21,6 +21,7 @@ from stillpath.models.plants import (
 from stillpath.models.reference_motion import reference_motion, reference_motion_of
 from stillpath.models.store import load_machine
 from stillpath.pipeline.caution import (
+    Choice,
     caution_for,
     choose_caution,
     design_mode,
@@ -29,6 +30,7 @@ from stillpath.pipeline.caution import (
 )
 from stillpath.pipeline.measuring.reference_shaper import BestShaper, cached_shaper
 from stillpath.pipeline.options import Options
+from stillpath.pipeline.result import Channel, ErrorFigures
 from stillpath.simulation.measures import contour_error
 from stillpath.simulation.response import response
 
@@ -177,3 +179,31 @@ def test_nobody_is_cautious_without_a_measured_set(tmp_path: Path) -> None:
         assert caution_for(machine, options, shaper(45.0), tmp_path, DT_S) is None
     measured = machine_of(45.0, 40.0)
     assert caution_for(measured, Options(robust="minimax"), shaper(45.0), tmp_path, DT_S) is None
+
+
+def channel(name: str, rms_um: float) -> Channel:
+    errors = ErrorFigures(
+        contour_rms_um=rms_um, contour_max_um=0.0, tracking_rms_um=0.0, tracking_max_um=0.0
+    )
+    return Channel(name=name, label=name, extruding=errors, all_motion=errors, residual_rms_um=0.0)
+
+
+def test_what_motor_steps_add_is_much_the_same_for_all_plants() -> None:
+    choice = Choice(
+        shares=(1.0, 1.0),
+        worst=1.0,
+        mean=0.5,
+        worst_to_none=0.3,
+        rms_um=0.3,
+        ranges={"before": (0.9, 1.2), "after": (1.0, 10.0)},
+        reference_um={"before": 10.0, "after": 0.3},
+    )
+    # Twice as much is shaken off as on the reference motion: .6 of these 3 um are the command's.
+    channels = [channel("before", 20.0), channel("after", 3.0), channel("shaper", 4.0)]
+    smooth, stepped = (choice.ranged(channels, steps=steps) for steps in (False, True))
+    assert smooth[1].contour_range_um == pytest.approx((3.0, 30.0))
+    rounded_um = (3.0**2 - 0.6**2) ** 0.5
+    expected = (np.hypot(0.6, 0.8 * rounded_um), np.hypot(6.0, 1.2 * rounded_um))
+    assert stepped[1].contour_range_um == pytest.approx(expected)
+    assert smooth[0].contour_range_um == stepped[0].contour_range_um == pytest.approx((18.0, 24.0))
+    assert stepped[2].contour_range_um is None
