@@ -492,3 +492,24 @@ def test_a_line_of_several_commands_does_what_the_strongest_does(read, line: str
     """A macro stops the motion, whatever stands beside it; a shaper's line is said again."""
     block, _ = read(f"G1 X1 F600\n{line}\nG1 X2\n", "reprapfirmware")
     assert block.events.kind.tolist() == [kind]
+
+
+@pytest.mark.parametrize("name", ["klipper", "marlin", "reprapfirmware"])
+def test_what_a_printer_lacks_is_told(read, name: str) -> None:
+    _, interpreter = read("G1 X5 F600\nG2 X9 I2\n", name, arcs=False)
+    (said,) = interpreter.warnings
+    assert said.startswith("line 2: G2: this machine draws no arcs (firmware.arcs)")
+    assert read("G2 X4 I2\n", name)[1].warnings == []
+
+
+@pytest.mark.parametrize("name", ["klipper", "marlin"])
+def test_a_retraction_that_a_printer_lacks_is_told(read, name: str) -> None:
+    _, interpreter = read("G1 X5 F600\nG10\nG1 X9\nG11\n", name, retraction=None)
+    assert [said[:12] for said in interpreter.warnings] == ["line 2: G10:", "line 4: G11:"]
+    # With words it sets temperatures of tools, a macro where there is one.
+    assert read("G10 P1 S200\n", name, retraction=None)[1].warnings == []
+
+
+def test_a_macro_of_that_name_is_the_users(read) -> None:
+    macros = {"arcs": False, "retraction": None, "stopping_macros": ("G2", "G10")}
+    assert read("G2 X9 I2\nG10\n", "klipper", **macros)[1].warnings == []
