@@ -9,6 +9,7 @@ and after them the event that stops the machine.
 from __future__ import annotations
 
 import copy
+import re
 from collections.abc import Iterator
 from typing import BinaryIO
 
@@ -33,6 +34,7 @@ __all__ = ["Interpreter", "interpret_bytes"]
 
 _BOM = b"\xef\xbb\xbf"
 _BOM_16 = (b"\xff\xfe", b"\xfe\xff")
+_MOVE = re.compile(rb"\s*G0*[0-3](?![\d.])", re.IGNORECASE)
 _PAD = b"\n" * PADDING
 _BLOCK_BYTES, _CHUNK = 1 << 17, 1 << 20
 _LONGEST_LINE = 1 << 24
@@ -141,6 +143,11 @@ class Interpreter:
         """Interpret the rest as the last line; it may lack its newline."""
         text = b"".join((*self._carry, _PAD))
         self._carry, self._carried = [], 0
+        if _MOVE.match(text):
+            self.state.warn(
+                "the file ends with a move and without a line end: it may have been cut off; "
+                "compare its size, and copy or export it again"
+            )
         return self._read(text) if len(text) > PADDING else []
 
     def blocks(self, file: BinaryIO) -> Iterator[ProgramBlock]:
