@@ -24,7 +24,7 @@ from stillpath.gcode.dialect import Action, Dialect
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.dialects import dialect_of
 from stillpath.gcode.firmware.registry import adapter
-from stillpath.gcode.lexer import Command, split_line
+from stillpath.gcode.lexer import Command, odd_numbers, split_line
 from stillpath.gcode.meta import META_WORDS, held_back, meta_command
 from stillpath.gcode.state import MachineState, nobody
 from stillpath.gcode.types import KEPT, EventKind, Events, Limits, ModalState, Moves, ProgramBlock
@@ -365,6 +365,9 @@ class Interpreter:
                 if handled >= 0:
                     return handled
             state.i[at.I_MOTION] = action - 19 if action > Action.MOVE else 1
+            for given, read in odd_numbers(command):
+                how = f"reads it as {read}" if read else "passes it over"
+                state.warn(f"{given} is not a number, and {self.dialect.title} {how}; correct it")
         needed = self.dialect.needed.get(name, "")
         for word in command.words:
             if word[1:] in ("NAN", "INF", "INFINITY") and word[0] in needed:
