@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import sys
+from io import TextIOWrapper
 from typing import Annotated, NoReturn
 
 import typer
@@ -55,6 +56,9 @@ _WITH_WORKERS = (["serve"], ["scheduler"], ["worker"])
 
 def main() -> NoReturn:
     """Run the command line and exit; the entry point of the `stillpath` command."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):  # a console may know no micro sign and no frames
+            stream.reconfigure(errors="replace")
     prepare_environment(computing=sys.argv[1:2] not in _WITH_WORKERS)
     sys.exit(run(sys.argv[1:]))
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from stillpath.gcode import _slots as at
+from stillpath.gcode.dialect import Word
 from stillpath.gcode.lexer import Command
 from stillpath.gcode.state import MachineState
 from stillpath.gcode.types import EventKind
 
-__all__ = ["cancel_object", "home", "retract", "tool"]
+__all__ = ["NO_ARCS", "NO_RETRACTION", "cancel_object", "home", "retract", "tool"]
 
 
 def home(state: MachineState, command: Command) -> int:
@@ -19,6 +20,26 @@ def home(state: MachineState, command: Command) -> int:
     state.settle()
     state.i[at.I_KNOWN] = known
     return status
+
+
+def no_arc(state: MachineState, command: Command) -> int:
+    """G2 and G3 where the machine states no arcs: skipped, a macro, or drawn after all."""
+    state.warn(
+        f"{command.name}: this machine draws no arcs (firmware.arcs), so the printer skips the "
+        "move; slice without arcs, or correct the machine"
+    )
+    return state.event(state.dialect.otherwise(command.name))
+
+
+def no_retraction(state: MachineState, command: Command) -> int:
+    """G10 and G11 where the machine states no retraction: skipped, or a macro."""
+    if set(command.words) <= {"G"}:  # Klipper keeps the name among the words
+        state.warn(
+            f"{command.name}: this machine has no retraction of its own (firmware.retraction), so "
+            "the printer skips the line unless it is a macro; switch firmware retraction off in "
+            "the slicer, or correct the machine"
+        )
+    return state.event(state.dialect.otherwise(command.name))
 
 
 def retract(state: MachineState, command: Command) -> int:
@@ -95,3 +116,7 @@ def tool(state: MachineState, command: Command) -> int:
         state.i[at.I_TOOL] = number
         state.tool_known = True
     return state.event(EventKind.UNKNOWN)
+
+
+NO_ARCS: dict[str, Word] = {"G2": no_arc, "G3": no_arc}
+NO_RETRACTION: dict[str, Word] = {"G10": no_retraction, "G11": no_retraction}

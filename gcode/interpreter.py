@@ -9,6 +9,7 @@ and after them the event that stops the machine.
 from __future__ import annotations
 
 import copy
+import re
 from collections.abc import Iterator
 from typing import BinaryIO
 
@@ -23,7 +24,7 @@ from stillpath.gcode.dialect import Action, Dialect
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.dialects import dialect_of
 from stillpath.gcode.firmware.registry import adapter
-from stillpath.gcode.lexer import Command, split_line
+from stillpath.gcode.lexer import Command, odd_numbers, split_line
 from stillpath.gcode.meta import META_WORDS, held_back, meta_command
 from stillpath.gcode.state import MachineState, nobody
 from stillpath.gcode.types import KEPT, EventKind, Events, Limits, ModalState, Moves, ProgramBlock
@@ -33,6 +34,7 @@ __all__ = ["Interpreter"]
 
 _BOM = b"\xef\xbb\xbf"
 _BOM_16 = (b"\xff\xfe", b"\xfe\xff")
+_MOVE = re.compile(rb"\s*G0*[0-3](?![\d.])", re.IGNORECASE)
 _PAD = b"\n" * PADDING
 _BLOCK_BYTES, _CHUNK = 1 << 17, 1 << 20
 _LONGEST_LINE = 1 << 24
@@ -141,6 +143,11 @@ class Interpreter:
         """Interpret the rest as the last line; it may lack its newline."""
         text = b"".join((*self._carry, _PAD))
         self._carry, self._carried = [], 0
+        if _MOVE.match(text):
+            self.state.warn(
+                "the file ends with a move and without a line end: it may have been cut off; "
+                "compare its size, and copy or export it again"
+            )
         return self._read(text) if len(text) > PADDING else []
 
     def blocks(self, file: BinaryIO) -> Iterator[ProgramBlock]:
@@ -358,6 +365,9 @@ class Interpreter:
                 if handled >= 0:
                     return handled
             state.i[at.I_MOTION] = action - 19 if action > Action.MOVE else 1
+            for given, read in odd_numbers(command):
+                how = f"reads it as {read}" if read else "passes it over"
+                state.warn(f"{given} is not a number, and {self.dialect.title} {how}; correct it")
         needed = self.dialect.needed.get(name, "")
         for word in command.words:
             if word[1:] in ("NAN", "INF", "INFINITY") and word[0] in needed:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from types import MappingProxyType
@@ -18,7 +18,7 @@ from types import MappingProxyType
 from stillpath.gcode.dialect import Dialect
 from stillpath.gcode.errors import GcodeError
 
-__all__ = ["Command", "extended_parameters", "split_classic", "split_line"]
+__all__ = ["Command", "extended_parameters", "odd_numbers", "split_classic", "split_line"]
 
 _LETTERS = re.compile(r"([A-Z_]+|[A-Z*])")
 _LINE_NUMBER = re.compile(r"\s*[Nn]\s*-?\d+\s*")
@@ -285,3 +285,22 @@ def _pairs(text: str, name: str) -> Mapping[str, str]:
     reader.commenters = "#;"
     pairs = [word.split("=", 1) for word in reader]
     return MappingProxyType({key.upper(): value for key, value in pairs})
+
+
+def odd_numbers(command: Command) -> Iterator[tuple[str, str]]:
+    """Yield words of a move that are no numbers, each with what is read of it: perhaps nothing.
+
+    Firmwares that read as far as they can take X1.2.3 for X1.2 and pass XNaN over.
+    """
+    code = command.text.split(";", 1)[0].upper()
+    for letter, text in command.words.items():
+        if letter not in "XYZEF":
+            continue
+        found = re.search(
+            rf"{letter}\s*{re.escape(text)}(\S*)" if text else rf"{letter}(\S*)", code
+        )
+        if found is None:
+            continue
+        rest = found[1]
+        if not text or (rest and not rest[0].isalpha() and rest[0] not in "*(:"):
+            yield f"{letter}{text}{rest}", f"{letter}{text}" if text else ""

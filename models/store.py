@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+from codecs import BOM_UTF8
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
@@ -81,7 +82,8 @@ def read_machine(document: str | bytes, source: str = "machine") -> Machine:
         Naming the first field that is wrong, its value and what it must be.
     """
     try:
-        parsed = from_json(document)
+        content = document.encode() if isinstance(document, str) else document
+        parsed = from_json(content.removeprefix(BOM_UTF8))  # Windows' editors write it
     except ValueError as error:
         raise ModelError(f"{source}: not JSON ({error})") from None
     try:

@@ -8,13 +8,14 @@ from typing import BinaryIO
 import numpy as np
 
 from stillpath.gcode.errors import GcodeError
+from stillpath.gcode.firmware.signatures import signed_at
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.pieces import Piece, VerbatimPart
 from stillpath.gcode.splitter import Splitter
 from stillpath.gcode.types import EventKind, ProgramBlock
 from stillpath.pipeline.clock import StageClock
 
-__all__ = ["FileParts"]
+__all__ = ["FileParts", "refuse_processed"]
 
 
 class FileParts:
@@ -44,15 +45,41 @@ class FileParts:
             The file was compensated before.
         """
         for block in self._clock.each("read", self._reader.blocks(self._source)):
-            _refuse_compensated(block)
+            refuse_processed(block)
             yield from self._clock.each("plan", self._splitter.push(block))
         yield from self._clock.each("plan", self._splitter.flush())
 
 
-def _refuse_compensated(block: ProgramBlock) -> None:
+def refuse_processed(block: ProgramBlock, do: str = "compensate") -> None:
+    """Raise GcodeError for a block of a file that this program wrote, also without its comments.
+
+    Parameters
+    ----------
+    block : ProgramBlock
+    do : str
+        What the user had better do with the original.
+    """
     stamped = np.flatnonzero(block.events.kind == EventKind.STAMP)
     if len(stamped):
         raise GcodeError(
-            "this file was already processed by stillpath; compensate the original",
+            f"this file was already processed by stillpath; {do} the original",
             line=int(block.events.line[stamped[0]]),
         )
+    place = signed_at(block.text)
+    if place is not None:
+        raise GcodeError(
+            "this file was already processed by stillpath, and its comments were stripped: these "
+            f"limits are those of a compensated stretch; {do} the original",
+            line=_line_at(block, place),
+            text=block.text[place : block.text.index(b"\n", place)].decode("latin-1"),
+        )
+
+
+def _line_at(block: ProgramBlock, place: int) -> int | None:
+    """Return the number of the line at a place of the block's text, counted from an event."""
+    events, offset = block.events, block.text_offset
+    before = int(np.searchsorted(events.byte_start, offset + place, side="right")) - 1
+    if before < 0:
+        return None
+    begin = int(events.byte_start[before]) - offset
+    return int(events.line[before]) + block.text.count(b"\n", begin, place)

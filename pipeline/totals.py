@@ -81,13 +81,15 @@ class Totals:
         compensates : bool
             Else the file is only measured, and nothing of it is left alone.
         """
+        rate = self.segments / self.compensated_s if self.compensated_s else 0.0
         return {
             "original_time_s": self.original_s,
             "time_s": self.time_s,
             "written_bytes": self.written,
             "segments": self.segments,
-            "segments_per_s": self.segments / self.compensated_s if self.compensated_s else 0.0,
-            "peak_segments_per_s": self.peak_rate,
+            "segments_per_s": rate,
+            # Counted by the second, and a piece may be shorter.
+            "peak_segments_per_s": max(self.peak_rate, rate),
             "peak_velocity_mm_s": self.peak_velocity,
             "peak_accel_mm_s2": self.peak_accel,
             "emission_rms_um": 1e3 * np.sqrt(self.gap2 / max(self.gap_count, 1)),

@@ -179,6 +179,12 @@ def _check(archive: zipfile.ZipFile, largest: int) -> None:
 
 def _chosen(names: list[str], plate: int | None) -> str:
     plates = {int(found[1]): name for name in names if (found := _PLATE.fullmatch(name))}
+    inside = next((name for name in names if name.lower().endswith((".gcode", ".bgcode"))), None)
+    if not plates and inside is not None:
+        raise GcodeError(
+            f"the file is a ZIP archive with {inside[:80]!r} in it, and no 3MF package: "
+            "unpack it, and give what was in it"
+        )
     if not plates:
         raise GcodeError(
             "the package holds no sliced plate (Metadata/plate_N.gcode): slice it, and export the "

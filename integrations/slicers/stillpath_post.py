@@ -22,6 +22,7 @@ import json
 import os
 import re
 import shlex
+import shutil
 import signal
 import stat
 import subprocess
@@ -153,11 +154,15 @@ def _on_server(path: Path, options: dict[str, Any], settings: Settings, voice: V
     """Let a server compensate, and replace the file."""
     before = path.stat()
     client = Service(settings.server, settings.key, settings.timeout, voice.progress)
-    with replacing(path) as temporary:
-        page = client.compensate(path, temporary, options, settings.wait)
-        now = path.stat()
-        if (now.st_size, now.st_mtime_ns) != (before.st_size, before.st_mtime_ns):
-            raise Failure(f"{path} was changed by somebody else while it was processed", 1)
+    # Who is killed while he waits or fetches leaves nothing beside the file.
+    with tempfile.TemporaryDirectory(prefix="stillpath-") as folder:
+        fetched = Path(folder) / "result"
+        page = client.compensate(path, fetched, options, settings.wait)
+        with replacing(path) as temporary:
+            shutil.copyfile(str(fetched), str(temporary))
+            now = path.stat()
+            if (now.st_size, now.st_mtime_ns) != (before.st_size, before.st_mtime_ns):
+                raise Failure(f"{path} was changed by somebody else while it was processed", 1)
     return page
 
 

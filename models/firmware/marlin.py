@@ -9,12 +9,15 @@ from __future__ import annotations
 import math
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from stillpath.models.document import Document, NonNegative, Positive
 from stillpath.models.firmware.common import AxisAllowance, FirmwareFacts, Hotend
 
 __all__ = ["Marlin", "MarlinPlanner", "MarlinShaper", "PerAxis", "PerAxisLimit"]
+
+
+_MOST_STEPS_PER_MM = 4000
 
 
 class PerAxis(Document):
@@ -24,6 +27,17 @@ class PerAxis(Document):
     y: Positive
     z: Positive
     e: Positive
+
+
+def _countable(steps: PerAxis) -> PerAxis:
+    """Refuse microsteps that Marlin's 32-bit step rates cannot count at the speeds of a stream."""
+    for axis, per_mm in (("x", steps.x), ("y", steps.y)):
+        if per_mm > _MOST_STEPS_PER_MM:
+            raise ValueError(
+                f"must be at most {_MOST_STEPS_PER_MM} in X and Y, and is {per_mm:g} in "
+                f"{axis.upper()}; state what M92 says"
+            )
+    return steps
 
 
 class PerAxisLimit(Document):
@@ -78,7 +92,9 @@ class Marlin(FirmwareFacts):
     bugfix-2.1.x since 2024, Prusa-Firmware-Buddy, or Bambu's closed firmware (an estimate)."""
     extruder: Hotend = Hotend()
     planner: MarlinPlanner = MarlinPlanner()
-    steps_per_mm: PerAxis = PerAxis(x=80.0, y=80.0, z=400.0, e=93.0)
+    steps_per_mm: Annotated[PerAxis, AfterValidator(_countable)] = PerAxis(
+        x=80.0, y=80.0, z=400.0, e=93.0
+    )
     """M92."""
     junction: Literal["deviation", "classic_jerk"] = "deviation"
     small_segment_junctions: bool = True

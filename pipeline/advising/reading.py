@@ -15,6 +15,7 @@ from stillpath.models.schedule import EMPTY, OperatingPoint
 from stillpath.pipeline.advising.choosing import LEVEL_STEP
 from stillpath.pipeline.advising.inserting import MARK
 from stillpath.pipeline.operating_point import Operation
+from stillpath.pipeline.parts import refuse_processed
 
 __all__ = ["FirstReading"]
 
@@ -42,12 +43,7 @@ class FirstReading:
 
     def see(self, block: ProgramBlock) -> None:
         """Take note of a block; refuse a file that was processed, or could not be restored."""
-        stamps = np.flatnonzero(block.events.kind == EventKind.STAMP)
-        if len(stamps):
-            raise GcodeError(
-                "this file was already processed by stillpath; advise the original",
-                line=int(block.events.line[stamps[0]]),
-            )
+        refuse_processed(block, "advise")
         if MARK in block.text:
             raise GcodeError(
                 f"the file has lines with {MARK.decode()!r}, so that advice could not be undone; "

@@ -310,3 +310,16 @@ def test_a_full_disk_is_told_with_its_place(pipeline, source, tmp_path, capsys):
     assert compensate(source, "-o", str(target), "-m", "ender3") == 1
     assert f"{target}: No space left on device; make room there" in one_line(capsys)
     assert [path.name for path in tmp_path.iterdir()] == ["part.gcode"]
+
+
+def test_a_console_that_knows_only_ascii_gets_what_it_can_show():
+    """A result would break at the micro sign, after its file was written."""
+    code = (
+        "import sys; from stillpath.cli import main as cli\n"
+        "cli.run = lambda _: print('0.92 µm ┃') or 3\ncli.main()"
+    )
+    ascii_only = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    ran = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, env=ascii_only
+    )
+    assert (ran.returncode, ran.stdout, ran.stderr) == (3, "0.92 ?m ?\n", "")

@@ -492,3 +492,49 @@ def test_a_line_of_several_commands_does_what_the_strongest_does(read, line: str
     """A macro stops the motion, whatever stands beside it; a shaper's line is said again."""
     block, _ = read(f"G1 X1 F600\n{line}\nG1 X2\n", "reprapfirmware")
     assert block.events.kind.tolist() == [kind]
+
+
+@pytest.mark.parametrize("name", ["klipper", "marlin", "reprapfirmware"])
+def test_what_a_printer_lacks_is_told(read, name: str) -> None:
+    _, interpreter = read("G1 X5 F600\nG2 X9 I2\n", name, arcs=False)
+    (said,) = interpreter.warnings
+    assert said.startswith("line 2: G2: this machine draws no arcs (firmware.arcs)")
+    assert read("G2 X4 I2\n", name)[1].warnings == []
+
+
+@pytest.mark.parametrize("name", ["klipper", "marlin"])
+def test_a_retraction_that_a_printer_lacks_is_told(read, name: str) -> None:
+    _, interpreter = read("G1 X5 F600\nG10\nG1 X9\nG11\n", name, retraction=None)
+    assert [said[:12] for said in interpreter.warnings] == ["line 2: G10:", "line 4: G11:"]
+    # With words it sets temperatures of tools, a macro where there is one.
+    assert read("G10 P1 S200\n", name, retraction=None)[1].warnings == []
+
+
+def test_a_macro_of_that_name_is_the_users(read) -> None:
+    macros = {"arcs": False, "retraction": None, "stopping_macros": ("G2", "G10")}
+    assert read("G2 X9 I2\nG10\n", "klipper", **macros)[1].warnings == []
+
+
+@pytest.mark.parametrize(
+    ("line", "given", "how"),
+    [
+        ("G1 X1.2.3 Y5", "X1.2.3", "reads it as X1.2"),
+        ("G1 X100,5 Y5", "X100,5", "reads it as X100"),
+        ("G1 Y5 XNaN ; X5", "XNAN", "passes it over"),
+        ("G1 X--5", "X--5", "passes it over"),
+        ("G1 X Y5", "X", "passes it over"),
+    ],
+)
+def test_what_is_no_number_is_told_where_it_is_read_all_the_same(
+    read, line: str, given: str, how: str
+) -> None:
+    _, interpreter = read(f"G1 F600\n{line}\n", "marlin")
+    assert interpreter.warnings == [
+        f"line 2: {given} is not a number, and Marlin {how}; correct it"
+    ]
+
+
+def test_numbers_of_all_kinds_are_numbers(read) -> None:
+    lines = "G1 X+1.5 Y.5 F600\nG1X1Y2*33\nG1 X 5 Y5.\nG1 X5 ; X1.2.3\nG0 X-.5(Y1.1.1)\n"
+    assert read(lines, "marlin-loose")[1].warnings == []
+    assert read("M83\nG1 X1e1 E1:2 F600\n", "reprapfirmware")[1].warnings == []

@@ -374,3 +374,19 @@ def test_origin(golden_machine: Machine) -> None:
     origins = [block.modal[k].origin_mm for k in block.moves.modal_id]
     assert origins == [(0, 0, 0), (10, 0, 0), (10, 0, 0.2), (0, 0, 0.2)]
     assert ends(block)[2:] == [[12, 0, 1.2, 0], [2, 0, 0, 0]]
+
+
+@pytest.mark.parametrize(
+    ("end", "told"),
+    [("G1 X115 Y1", True), ("G1 X1\nM84", False), ("G1 X1\n; end", False), ("G1 X1\n", False)],
+)
+def test_a_file_that_may_have_been_cut_off_is_told(
+    golden_machine: Machine, end: str, told: bool
+) -> None:
+    reader = Interpreter(golden_machine)
+    for chunk in ("G28\nG1 X5 F600\n", end[:4], end[4:]):
+        reader.push(chunk.encode())
+    reader.flush()
+    said = [warning for warning in reader.warnings if "may have been cut off" in warning]
+    assert len(said) == told
+    assert not told or said[0].startswith("line 3: the file ends with a move")

@@ -222,7 +222,7 @@ def test_short_segments_are_part_of_an_arc() -> None:
     # 5000 * .08 * .9659 / .0341 = 11 340.
     wide = {"accel_x_mm_s2": 5000.0, "accel_y_mm_s2": 5000.0, "travel_accel_mm_s2": 5000.0}
     points = arc(math.radians(30), 0.5, 40)
-    fine = PerAxis(x=8000.0, y=8000.0, z=400.0, e=100.0)  # so that rounding bends nothing
+    fine = PerAxis(x=4000.0, y=4000.0, z=400.0, e=100.0)  # so that rounding bends nothing
     phases = plan(machine(steps_per_mm=fine), points, 150.0, **wide)
     assert phases.start_mm_s[20] == pytest.approx(67.73, rel=2e-3)
     phases = plan(machine(steps_per_mm=fine, small_segment_junctions=False), points, 150.0, **wide)

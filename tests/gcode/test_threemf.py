@@ -99,6 +99,8 @@ def test_what_is_no_package_has_no_plates(tmp_path: Path, content: bytes):
 
 def test_packages_that_are_refused(tmp_path: Path):
     refused(package({}), tmp_path, "no sliced plate")
+    wrapped = package({}, more={"part.gcode": TEXT})
+    refused(wrapped, tmp_path, "ZIP archive with 'part.gcode' in it.*unpack")
     for name in ("../evil.gcode", "/etc/x", "a/../../x", "C:\\x", "..\\x"):
         refused(package({1: TEXT}, more={name: b"x"}), tmp_path, "leads out of it")
     with warnings.catch_warnings():

@@ -114,3 +114,21 @@ def test_a_wrong_field_is_named(
         read_machine(json.dumps(document), "mine.json")
     assert str(raised.value).startswith("mine.json: ")
     assert "\n" not in str(raised.value)
+
+
+def test_a_byte_order_mark_of_windows_is_no_fault(document: dict[str, Any]) -> None:
+    plain = json.dumps(document)
+    assert read_machine(b"\xef\xbb\xbf" + plain.encode()) == read_machine(plain)
+    assert read_machine("\ufeff" + plain) == read_machine(plain)
+
+
+def test_microsteps_that_marlin_cannot_count_are_refused(document: dict[str, Any]) -> None:
+    steps = {"x": 80.0, "y": 1e9, "z": 102400.0, "e": 93.0}
+    document["firmware"] = {"kind": "marlin", "steps_per_mm": steps}
+    words = (
+        r"firmware.steps_per_mm.*at most 4000 in X and Y, and is 1e\+09 in Y; state what M92 says"
+    )
+    with pytest.raises(ModelError, match=words):
+        read_machine(json.dumps(document))
+    steps["y"] = 3200.0
+    read_machine(json.dumps(document))

@@ -18,6 +18,7 @@ from stillpath.gcode.firmware.encoding import as_moves
 from stillpath.gcode.firmware.writing import StreamWriter
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.pieces import VerbatimPart
+from stillpath.models.firmware import Klipper, Marlin, RepRapFirmware
 from stillpath.models.machine import AxisTravel, Machine
 from stillpath.models.plants import plant_set
 from stillpath.models.reference_motion import reference_motion
@@ -114,6 +115,25 @@ def test_stamped_file_is_refused(tmp_path: Path, cache: Path) -> None:
     with np.load(again / "motion.npz") as motion:
         assert motion["t"][0] == 0
         assert len(motion["x"]) > 1000
+
+
+@pytest.mark.parametrize("firmware", [Klipper(), Marlin(), RepRapFirmware()])
+def test_a_file_without_its_comments_is_refused_too(
+    firmware: Klipper | Marlin | RepRapFirmware, tmp_path: Path, cache: Path
+) -> None:
+    machine = load_machine("ender3").model_copy(update={"firmware": firmware})
+    source, written = tmp_path / "in.gcode", tmp_path / "out.gcode"
+    source.write_bytes(SMALL)
+    compensate_file(source, written, machine, Options(robust="off"), cache_dir=cache)
+    lines = [line.split(b";")[0].strip() for line in written.read_bytes().splitlines()]
+    source.write_bytes(b"\r\n".join(line for line in lines if line))
+    # Other machines tell it as well.
+    with pytest.raises(GcodeError, match=r"line \d+: .* comments were stripped") as refused:
+        compensate_file(source, written, load_machine("ender3"), Options(), cache_dir=cache)
+    number = refused.value.line
+    assert number is not None
+    line = source.read_text().splitlines()[number - 1]
+    assert line.startswith(refused.value.text.removesuffix("..."))
 
 
 def test_method_none_returns_the_bytes(tmp_path: Path, cache: Path) -> None:

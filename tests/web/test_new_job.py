@@ -129,6 +129,20 @@ def test_a_request_that_is_refused_says_why(visitor: Visitor, tmp_path: Path):
     expect(page.get_by_role("alert")).to_contain_text("tolerance_um")
 
 
+def test_warnings_name_the_controls_of_the_page(visitor: Visitor, tmp_path: Path):
+    file = tmp_path / "part.gcode"
+    moves = b"".join(b"G1 X%d Y10 E%.1f\n" % (x, 0.05 * x) for x in range(10, 20))
+    file.write_bytes(b"; gcode_flavor = reprapfirmware\nG28\nG92 E0.45\nG1 X9 Y10 F3000\n" + moves)
+    page = visitor.open()
+    page.get_by_text("More options").click()
+    page.get_by_label("Compensate", exact=True).select_option("walls")
+    expect(page.get_by_label("File is written for")).to_be_visible()
+    hand_in(page, file)
+    expect(page.get_by_text("choose klipper under “File is written for”")).to_be_visible()
+    expect(page.get_by_text("“Compensate: Outer walls”: ")).to_be_visible()
+    assert "--" not in page.locator("main").inner_text()
+
+
 def test_a_job_is_cancelled_and_deleted(visitor: Visitor, service: Service):
     # Robust designs take long enough to be stopped in the middle.
     long = b"; to be stopped\n" + GEAR.read_bytes() * 4

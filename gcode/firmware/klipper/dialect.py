@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import re
 
-from stillpath.gcode.commands import cancel_object, home, retract
+from stillpath.gcode.commands import NO_ARCS, NO_RETRACTION, cancel_object, home, retract
 from stillpath.gcode.dialect import NEEDED, Action, Dialect, Word, words
 from stillpath.gcode.firmware.klipper import commands, flushing
 from stillpath.gcode.types import EventKind
@@ -127,6 +127,8 @@ def klipper(firmware: Klipper) -> Dialect:
         return EventKind.HARMLESS if harmless else EventKind.UNKNOWN
 
     table = {
+        **({} if firmware.arcs else NO_ARCS),
+        **({} if firmware.retraction else NO_RETRACTION),
         **FOREIGN,
         **NATIVE,
         **{name.upper(): EventKind.STOP for name in firmware.stopping_macros},

@@ -9,11 +9,17 @@ from stillpath.gcode.firmware.klipper.limits import KlipperLimits
 from stillpath.gcode.types import Limits
 from stillpath.models.firmware import Klipper
 
-__all__ = ["IN_STREAM_MARK_MM_S", "KlipperStreamCommands"]
+__all__ = ["IN_STREAM_MARK_MM_S", "SIGNATURE", "KlipperStreamCommands"]
 
 IN_STREAM_MARK_MM_S = 5e-7
 """Added to the square corner velocity of a stream, and of the file's own moves inside one: it tells
 stillpath.cfg that a PAUSE here is in mid stream, with the shaper off."""
+
+SIGNATURE = (
+    rb"SET_VELOCITY_LIMIT VELOCITY=\S+ ACCEL=\S+ ACCEL_TO_DECEL=\S+ "
+    rb"SQUARE_CORNER_VELOCITY=\S+ MINIMUM_CRUISE_RATIO=0\s"
+)
+"""Limits of a stream, in an order and for two ages of Klipper at once, as nobody else has them."""
 
 
 class KlipperStreamCommands:

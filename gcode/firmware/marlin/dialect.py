@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from stillpath.gcode.commands import cancel_object, home, retract, tool
+from stillpath.gcode.commands import NO_ARCS, NO_RETRACTION, cancel_object, home, retract, tool
 from stillpath.gcode.dialect import (
     Action,
     ArcRule,
@@ -171,6 +171,8 @@ def marlin(firmware: Marlin) -> Dialect:
         return EventKind.HARMLESS if skipped else EventKind.UNKNOWN
 
     table = {
+        **({} if firmware.arcs else NO_ARCS),
+        **({} if firmware.retraction else NO_RETRACTION),
         **STEPS,
         **LIMITS,
         **{name.upper(): EventKind.STOP for name in firmware.stopping_macros},

@@ -10,7 +10,13 @@ from stillpath.gcode.firmware.marlin.limits import MarlinLimits, without_advance
 from stillpath.gcode.types import Limits
 from stillpath.models.firmware import Marlin
 
-__all__ = ["MarlinStreamCommands"]
+__all__ = ["SIGNATURE", "MarlinStreamCommands"]
+
+SIGNATURE = (
+    rb"M203 X\S+ Y\S+ Z\S+ E\S+\s+M204 P\S+ R\S+ T\S+\s+"
+    rb"M205 B0 S0 T0 (?:J\S+|X\S+ Y\S+ Z\S+ E\S+)\s"
+)
+"""Limits of a stream: M503 has the same order, but decimals, and no B of 0 by default."""
 
 _NOTES = (
     "between 'stream on' and 'stream off' the limits of M201, M203, M204 and M205",

@@ -5,7 +5,7 @@ Sources: docs/dialects.md, which also says what was not read in the firmware's o
 
 from __future__ import annotations
 
-from stillpath.gcode.commands import cancel_object, home, retract
+from stillpath.gcode.commands import NO_ARCS, cancel_object, home, retract
 from stillpath.gcode.dialect import (
     Action,
     ArcRule,
@@ -125,6 +125,7 @@ def reprapfirmware(firmware: RepRapFirmware) -> Dialect:
         return EventKind.UNKNOWN if macro and not skipped else EventKind.HARMLESS
 
     table = {
+        **({} if firmware.arcs else NO_ARCS),
         **STEPS,
         **LIMITS,
         **{name.upper(): EventKind.STOP for name in firmware.stopping_macros},

@@ -8,7 +8,7 @@ from stillpath.gcode.firmware.reprapfirmware.limits import RepRapLimits
 from stillpath.gcode.types import Limits
 from stillpath.models.firmware import RepRapFirmware
 
-__all__ = ["RepRapStreamCommands"]
+__all__ = ["SIGNATURE", "RepRapStreamCommands"]
 
 _AXES = ("x", "y", "z", "e")
 _FENCE = "G1"
@@ -16,6 +16,12 @@ _FENCE = "G1"
 the ring and is not planned yet. A G1 without words waits until that is planned, and is no move
 itself (RepRapFirmware src/GCodes/GCodes2.cpp, cases 1, 201, 203, 204 and 566; GCodes.cpp,
 DoStraightMove; 3.5)."""
+
+SIGNATURE = (
+    rb"G1\s+M201 X\S+ Y\S+ Z\S+ E\S+\s+M203 X\S+ Y\S+ Z\S+ E\S+ I\S+\s+"
+    rb"M204 P\S+ T\S+\s+M566 X\S+ Y\S+ Z\S+ E\S+ P1\s"
+)
+"""Limits of a stream after their fence, a G1 without words, which nobody else writes."""
 
 
 class RepRapStreamCommands:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from pathlib import Path
 
 from stillpath.models.errors import ModelError
@@ -41,7 +40,7 @@ _LOOKED_FOR = (
 
 
 def read_measurements(
-    path: Path, *, axis: str | None = None, settings: ReadSettings | None = None
+    path: Path, *, settings: ReadSettings | None = None
 ) -> tuple[Measurement, ...]:
     """Read a file of any known format.
 
@@ -50,16 +49,14 @@ def read_measurements(
     path : Path
         Its name is used for the axis (resonances_x_..., raw_data_axis=1.000,1.000_...), and
         for messages.
-    axis : str, optional
-        Tested axis; goes before the settings and the name.
     settings : ReadSettings, optional
         What the file does not carry.
 
     Raises
     ------
     ModelError
-        Naming file, line and column, if the file is not of a known format, cannot be used, or
-        is larger than `LARGEST_BYTES`.
+        Naming file, line and column, if the file is not of a known format, cannot be used, is
+        larger than `LARGEST_BYTES`, or says another axis than the settings.
     """
     try:
         size = path.stat().st_size
@@ -68,26 +65,33 @@ def read_measurements(
         content = path.read_bytes()
     except OSError as error:
         raise ModelError(f"cannot read {path.name}: {error.strerror}") from None
-    return read_content(content, path.name, axis=axis, settings=settings)
+    return read_content(content, path.name, settings=settings)
 
 
 def read_content(
-    content: bytes, name: str, *, axis: str | None = None, settings: ReadSettings | None = None
+    content: bytes, name: str, *, settings: ReadSettings | None = None
 ) -> tuple[Measurement, ...]:
     """Read the content of a file called `name`; see `read_measurements`."""
     settings = settings or ReadSettings()
     if not content.strip():
         raise ModelError(f"{name}: the file is empty")
-    named = _axis_in_name(name)
-    axis = axis or settings.axis or named
-    if axis is not None:
-        axis = axis.strip().lower()
-        direction_of(axis, allow_z=True)
-    found = _from_content(content, name, axis, settings)
-    if named in (None, axis):
-        return found
-    note = f"its name says axis {named}; it was taken as axis {axis}"
-    return tuple(replace(one, notes=(*one.notes, note)) for one in found)
+    named = _axes_in_name(name)
+    if settings.axis is None:
+        return _from_content(content, name, named[0] if len(named) == 1 else None, settings)
+    asked = settings.axis.strip().lower()
+    if named and not any(_are_parallel(asked, one) for one in named):
+        raise ModelError(
+            f"{name}: its name says axis {' or '.join(named)}, but it was given as axis {asked}; "
+            "give no axis, or rename the file if the name is wrong"
+        )
+    found = _from_content(content, name, asked, settings)
+    held = [one.axis for one in found if one.axis is not None and _is_axis(one.axis)]
+    for axis in held:
+        if not _are_parallel(asked, axis):
+            raise ModelError(
+                f"{name}: it holds axis {axis}, but was given as axis {asked}; give no axis"
+            )
+    return found
 
 
 def _from_content(
@@ -150,12 +154,24 @@ def _from_table(table: Table, axis: str | None, settings: ReadSettings) -> tuple
     )
 
 
-def _axis_in_name(name: str) -> str | None:
-    found = _KLIPPER_NAME.search(name.lower()) or _ANY_NAME.search(name.lower())
-    if found is None:
-        return None
+def _axes_in_name(name: str) -> tuple[str, ...]:
+    """Return the axis in Klipper's name of a file, else every axis that the name may say."""
+    name = name.lower()
+    klipper = _KLIPPER_NAME.search(name)
+    texts = [klipper[1]] if klipper else [found[1] for found in _ANY_NAME.finditer(name)]
+    return tuple(dict.fromkeys(text for text in texts if _is_axis(text)))
+
+
+def _is_axis(text: str) -> bool:
     try:
-        direction_of(found[1], allow_z=True)
+        direction_of(text, allow_z=True)
     except ModelError:
-        return None
-    return found[1]
+        return False
+    return True
+
+
+def _are_parallel(one: str, other: str) -> bool:
+    if one == other:
+        return True
+    (a, b), (c, d) = (direction_of(text, allow_z=True) for text in (one, other))
+    return abs(a * c + b * d) > 1 - 1e-6

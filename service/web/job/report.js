@@ -2,6 +2,7 @@
 
 import { h } from "../lib/dom.js";
 import { isAbort } from "../lib/api.js";
+import { namingControls } from "../lib/controls.js";
 import { bytes, capital, counted, duration, grouped, um } from "../lib/format.js";
 import { problemPanel } from "../lib/problem.js";
 import { folded, longTable, table } from "../parts/table.js";
@@ -23,7 +24,7 @@ export function reportSections(job, report, signal) {
     headline(report, channels),
     warnings(report),
     waysToPrint(job, report),
-    section("Error of the nozzle", report.notes.map((/** @type {string} */ note) => h("p", null, note)),
+    section("Error of the nozzle", report.notes.map((/** @type {string} */ note) => h("p", null, namingControls(note))),
       report.confirmation ? h("p", null, `The machine's model: ${report.confirmation}.`) : null, errorTable(channels, labels),
       h("p.hint", null, "Contour: distance to the planned path. Tracking: distance to where the nozzle was planned to be at that moment.")),
     layers(job, labels, signal),
@@ -47,7 +48,7 @@ function section(title, ...parts) {
 function warnings(report) {
   if (report.warnings.length === 0) return null;
   return h("section.notice", { "aria-label": "Please read" }, h("h2", null, "Please read"),
-    h("ul", null, report.warnings.map((/** @type {string} */ text) => h("li", null, text))));
+    h("ul", null, report.warnings.map((/** @type {string} */ text) => h("li", null, namingControls(text)))));
 }
 
 /** @param {any[]} channels @param {Record<string, string>} labels */

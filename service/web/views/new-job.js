@@ -2,6 +2,7 @@
 
 import { getJson, isAbort, upload } from "../lib/api.js";
 import { announce } from "../lib/announce.js";
+import { namingControls } from "../lib/controls.js";
 import { fill, h } from "../lib/dom.js";
 import { bytes } from "../lib/format.js";
 import { problemPanel } from "../lib/problem.js";
@@ -172,7 +173,7 @@ function wayToPrint(onChange) {
     refusal = reason;
     live.disabled = reason !== null;
     if (reason !== null) file.checked = true;
-    fill(hint, reason === null ? "" : `It cannot be printed live: ${reason}.`);
+    fill(hint, reason === null ? "" : `It cannot be printed live: ${namingControls(reason)}.`);
     hint.hidden = reason === null;
   };
   return { element, refuse, isLive: () => live.checked, isPossible: () => refusal === null };

@@ -63,6 +63,7 @@ def test_klipper_log_is_read_as_written(accel: np.ndarray, head: str) -> None:
         ("adxl345-20240101_120000.csv", None),
         ("run-Y.csv", "y"),
         ("voron_z_tilt_raw_data_x.csv", "x"),
+        ("x_max_run_y.csv", None),
     ],
 )
 def test_axis_is_in_the_name(name: str, axis: str | None) -> None:
@@ -71,14 +72,21 @@ def test_axis_is_in_the_name(name: str, axis: str | None) -> None:
     assert log.axis == axis
 
 
-def test_argument_goes_before_settings_and_name(tmp_path: Path) -> None:
-    path = tmp_path / "raw_data_x_a.csv"
-    path.write_text(klipper(*some_log()))
-    settings = ReadSettings(axis="y")
-    assert read_measurements(path, settings=settings)[0].axis == "y"
-    assert read_measurements(path, axis="1,1", settings=settings)[0].axis == "1,1"
-    with pytest.raises(ModelError, match="not a direction"):
-        read_measurements(path, axis="w")
+def test_the_settings_say_the_axis_where_the_name_does_not(tmp_path: Path) -> None:
+    for name in ("adxl345-20240101.csv", "x_max_run_y.csv", "raw_data_axis=0.000,-1.000_a.csv"):
+        path = tmp_path / name
+        path.write_text(klipper(*some_log()))
+        assert read_measurements(path, settings=ReadSettings(axis="y"))[0].axis == "y"
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [("raw_data_x_a.csv", "x"), ("run-X.csv", "x"), ("raw_data_axis=1.000,1.000_a.csv", "1.000")],
+)
+def test_a_name_that_says_another_axis_is_refused(name: str, says: str) -> None:
+    words = f"{name}: its name says axis {says}.*given as axis y; give no axis, or rename the file"
+    with pytest.raises(ModelError, match=words):
+        read(klipper(*some_log()), name, axis="y")
 
 
 def test_gap_says_where_and_how_long() -> None:
@@ -202,7 +210,10 @@ def test_swept_sine_with_axes() -> None:
     lines = ["time_s,cmd_acc,meas_acc,axis"]
     for i, axis in enumerate("XY"):
         lines += [f"{k / 500!r},{u!r},{y!r},{axis}" for k, (u, y) in enumerate(values[i].tolist())]
-    logs = read_content("\n".join(lines).encode(), "sweep.csv")
+    content = "\n".join(lines).encode()
+    with pytest.raises(ModelError, match=r"sweep.csv: it holds axis x, but was given as axis y"):
+        read_content(content, "sweep.csv", settings=ReadSettings(axis="y"))
+    logs = read_content(content, "sweep.csv")
     assert [log.axis for log in logs] == ["x", "y"]
     for log, expected in zip(logs, values, strict=True):
         assert isinstance(log, DrivenLog)
