@@ -236,7 +236,8 @@ class LastCheck:
             self._filament_mm,
         )
         written.line += lines
-        if taken and wanted.code in self._original.perhaps and not self._is_wanted(wanted, found):
+        known = found == at.SAME and wanted.counts_filament(self._after.state)
+        if taken and not known and wanted.code in self._original.perhaps:
             self._take_earlier(wanted.code, carried_out=found == at.SAME)
             return
         if taken:
@@ -263,14 +264,6 @@ class LastCheck:
             written.skip(end + 1)
             if self._streaming and self._wanted is None:
                 self._take_harmless()
-
-    def _is_wanted(self, wanted: Wanted, found: int) -> bool:
-        """Whether a line is the one waited for and no earlier one with its text.
-
-        Where place and filament are as the original has them there, it does the same in any case.
-        """
-        counted = not np.isnan(self._before.state[at.FED] + self._after.state[at.FED])
-        return found == at.SAME and counted and wanted.kind is Kind.RESTS
 
     def _takes_line(self, line: bytes, wanted: Wanted) -> bool:
         """Take a line that is no move of ours, unless the one waited for came before."""
@@ -299,7 +292,11 @@ class LastCheck:
     def _takes(self, code: bytes, *, held_back: bool) -> bool:
         """Take a line of a stream for one of the original, if it is one."""
         wanted, perhaps = self._wanted, self._original.perhaps
-        if wanted is not None and is_same(code, wanted.code) and code not in perhaps:
+        if (
+            wanted is not None
+            and is_same(code, wanted.code)
+            and (code not in perhaps or self._stands_before(wanted))
+        ):
             compared = wanted.kind is Kind.RESTS and not held_back
             if compared:
                 # Before it too: where E is absolute, what was fed too much comes back with it.
@@ -323,6 +320,12 @@ class LastCheck:
             self._kept += 1
             return True
         return False
+
+    def _stands_before(self, wanted: Wanted) -> bool:
+        """Whether place and filament are the original's: an earlier line would do the same here."""
+        after = self._after.state
+        found = at.compare(wanted.before, after, at.WITHIN, self._place_mm, self._filament_mm)
+        return found == at.SAME and wanted.counts_filament(after)
 
     def _take_earlier(self, code: bytes, *, carried_out: bool) -> None:
         """Take a line for the first with its text that may be there, not for the one waited for.

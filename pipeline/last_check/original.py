@@ -93,6 +93,10 @@ class Wanted:
     array: NDArray[np.uint8] = field(default_factory=lambda: np.frombuffer(b"", np.uint8))
     before: NDArray[np.float64] = field(default_factory=lambda: np.zeros(at.SIZE))
 
+    def counts_filament(self, state: NDArray[np.float64]) -> bool:
+        """Whether filament fed before it, and in another state, is known."""
+        return self.kind is Kind.RESTS and not np.isnan(self.before[at.FED] + state[at.FED])
+
 
 class Place(NamedTuple):
     """A place in the original, and what its reader knew there."""

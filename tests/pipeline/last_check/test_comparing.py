@@ -461,9 +461,22 @@ LIFTED_AGAIN = (
 )
 
 
+LAYER_AGAIN = (
+    "G28\nM82\nG92 E0\nG1 Z.2 F600\n"
+    + "".join(
+        f"G1 Z{z} F600\nG1 X100 Y100 F9000\nG1 X115 Y100 E{10 * z + 1} F6000\n"
+        f"G1 X115 Y115 E{10 * z + 1.5}\nG1 X100 Y115 E{10 * z + 2}\nG1 X100 Y100 E{10 * z + 2.5}\n"
+        for z in (0.2, 0.4, 0.6)
+    )
+    + "G92 E0\nM84\n"
+)
+
+
 @pytest.mark.parametrize(
     ("kind", "text"),
     [
+        # A layer begins with a move to where the head stands already.
+        pytest.param("klipper", LAYER_AGAIN, id="layer again"),
         # A retraction is the one waited for, though those before it might have moved X and Y.
         pytest.param("marlin", LIFTED_AGAIN, id="lifted again"),
         # Filament is counted anew at a line between two streams.
