@@ -118,7 +118,7 @@ def test_two_services_share_the_work_and_one_may_die(far: Far):
     all_done(site, ids)
     assert all(site.get(job_id).attempt == 1 for job_id in ids)
 
-    last = site.submit("slow-once 9")
+    last = site.submit("slow-once")
     site.running(last)
     workers.stop()
     assert until(lambda: site.get(last)).state is JobState.QUEUED
