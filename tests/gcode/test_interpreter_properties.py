@@ -15,7 +15,7 @@ from stillpath.models.machine import Machine
 
 relaxed = settings(
     deadline=None,
-    max_examples=150,
+    max_examples=60,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
 )
 
