@@ -133,7 +133,7 @@ def curves() -> str:
 
 
 FILES: dict[str, Callable[[], str]] = {
-    "two objects": lambda: two_objects(layers=1),
+    "two objects": two_objects,
     "curves": curves,
     "gear": lambda: GEAR.read_text().partition(";LAYER:1")[0],
 }
