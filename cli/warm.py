@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
+import multiprocessing
 import tempfile
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from stillpath.cli.arguments import MachineOption, check_input
+
+if TYPE_CHECKING:
+    from stillpath.models.machine import Machine
 
 __all__ = ["register"]
 
@@ -43,13 +48,34 @@ def warm(
         progress_shown() as progress,
     ):
         report = Path(folder) / "report"
-        result = compensate_file(
-            source,
-            Path(folder) / source.name,
-            found.machine,
-            Options(),
-            cache_dir=Path(folder),
-            progress=progress,
-            layers=report,
+        # A job designs its command before it reads the file: what reads is compiled meanwhile.
+        reading = multiprocessing.get_context("spawn").Process(
+            target=_read,
+            args=(source, Path(folder) / "motion.npz", found.machine),
+            daemon=True,
         )
-        write_report(result, report)
+        reading.start()
+        try:
+            result = compensate_file(
+                source,
+                Path(folder) / source.name,
+                found.machine,
+                Options(),
+                cache_dir=Path(folder),
+                progress=progress,
+                layers=report,
+            )
+            write_report(result, report)
+        except BaseException:
+            reading.terminate()
+            raise
+        finally:
+            reading.join()
+
+
+def _read(source: Path, target: Path, machine: Machine) -> None:
+    """Plan a file's motion; what is wrong with the file, the job beside it says."""
+    from stillpath.pipeline.simulate import plan_file
+
+    with contextlib.suppress(Exception):
+        plan_file(source, target, machine)

@@ -18,7 +18,7 @@ GEAR = str(ROOT / "examples" / "cura_ender3_gear24.gcode")
     "command",
     [
         ["emission.py", GEAR, "--machines", "ender3", "--tolerance-um", "2"],
-        ["bed_slinger.py"],
+        ["bed_slinger.py", "--kg", "0.1", "--moving-kg", "0.16"],
         ["ripple.py"],
         ["proof.py", "--machines", "ender3"],
         ["containers.py", GEAR],

@@ -482,8 +482,9 @@ def test_api(client: Any, off: DesignReport) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("axis", ["x", "y"])
-@pytest.mark.parametrize("name", ["taz6-x", "voron-v0", "generic-corexy"])
+@pytest.mark.parametrize(
+    ("name", "axis"), [("taz6-x", "x"), ("voron-v0", "y"), ("generic-corexy", "x")]
+)
 def test_whole_report(name: str, axis: str) -> None:
     report = design_report(load_machine(name), axis)
     assert len(report.robustness.errors_percent) == 21

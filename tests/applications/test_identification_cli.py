@@ -225,7 +225,7 @@ def test_what_a_model_does_not_say(store: MachineStore, folder: Path, capsys) ->
 # What cannot be used
 
 
-@pytest.mark.parametrize("what", BROKEN)
+@pytest.mark.parametrize("what", ["same axis twice", "gap", "of nothing known"])
 def test_broken_files_leave_everything_as_it_was(
     what: str, store: MachineStore, folder: Path, capsys
 ) -> None:

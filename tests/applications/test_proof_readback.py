@@ -168,7 +168,7 @@ def test_files_that_are_no_log(machine, printed, tmp_path):
     [
         ("voron-v24-250", 3200, 1 + 3e-4, 255, 60),
         ("generic-bedslinger", 1600, 1 - 3e-4, 200, 90),
-        ("annex-k3", 3200, 1 + 1e-4, -15, 300),
+        ("annex-k3", 3200, 1 + 1e-4, -15, 120),
         ("taz6-x", 3200, 1 - 1e-4, 300, 20),
     ],
 )

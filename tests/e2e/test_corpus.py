@@ -16,6 +16,7 @@ from stillpath.pipeline.options import Options
 from tests.e2e.round_trip import corpus_files, excerpt, flaws, made_to_fit, text_of
 from tests.fuzz.machines import KINDS, machine_of
 from tests.gcode.plain_reader import is_motion, read
+from tests.gcode.states import differences
 
 FIRMWARES = [k for k in KINDS if k not in ("prusa", "bambu")]
 _LONG = "RepRapFirmware aborts the print at more than 255"
@@ -60,7 +61,9 @@ def test_the_plain_reader() -> None:
 @pytest.mark.parametrize("kind", FIRMWARES)
 @pytest.mark.parametrize("name", corpus_files())
 def test_round_trip(name: str, kind: str, tmp_path: Path, cache: Path, shared_dir: Path) -> None:
-    data = excerpt(text_of(shared_dir / "corpus" / name))
+    # Klipper's files are the longest: what is read and split is the same for all firmwares.
+    text = text_of(shared_dir / "corpus" / name)
+    data = excerpt(text, head=4000 if kind == "klipper" else 800)
     machine = made_to_fit(machine_of(kind), data)
     source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"
     source.write_bytes(data)
@@ -76,6 +79,8 @@ def test_round_trip(name: str, kind: str, tmp_path: Path, cache: Path, shared_di
                 assert target.read_bytes() == data
             else:
                 assert flaws(data, target.read_bytes(), machine) == []
+                if kind == "klipper":
+                    assert differences(data, target.read_bytes(), machine) == []
             continue
         assert source.read_bytes() == data
         assert [p.name for p in tmp_path.iterdir()] == ["in.gcode"]

@@ -16,7 +16,7 @@ from tests.gcode.cutting import blocks_of
 
 relaxed = settings(
     deadline=None,
-    max_examples=150,
+    max_examples=60,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
 )
 

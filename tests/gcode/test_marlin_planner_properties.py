@@ -64,7 +64,7 @@ def plan(firmware: Marlin, parts: list[Moves], *, corexy: bool = False) -> Phase
 
 
 @given(MACHINES, streams(), st.booleans())
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_what_every_plan_keeps(firmware: Marlin, moves: Moves, corexy: bool) -> None:
     phases = plan(firmware, [moves], corexy=corexy)
     assert phases.move_index.tolist() == list(range(len(moves)))
@@ -220,7 +220,7 @@ def interrupts(
     st.booleans(),
     st.sampled_from([0.0, 30_000.0]),
 )
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_step_times_are_those_of_the_interrupts(
     steps: int,
     decades: float,

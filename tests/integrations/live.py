@@ -222,7 +222,7 @@ def with_event(script: str) -> str:
     `script`: one of `EVENTS`, or other lines.
     """
     event, script = script, EVENTS.get(script, script)
-    lines = two_objects().split("\n")
+    lines = two_objects(layers=1).split("\n")
     fast = [k for k, line in enumerate(lines) if line.startswith("G1 X") and "F9000" in line]
     happens = script.split("\n")
     if event == "CANCEL_PRINT":

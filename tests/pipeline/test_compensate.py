@@ -390,29 +390,6 @@ def check_marks(original: bytes, written: bytes, machine: Machine) -> None:
         assert not b.stream
 
 
-def all_files(folder: str) -> list[str]:
-    beside = Path(__file__).parents[3] / "shared" / "corpus" / folder
-    return [f"{folder}/{p.name}" for p in sorted(beside.glob("*.gz"))] if beside.is_dir() else []
-
-
-@pytest.mark.shared
-@pytest.mark.slow
-@pytest.mark.parametrize("name", [*all_files("own"), *all_files("third_party")])
-def test_every_file(tmp_path: Path, cache: Path, shared_dir: Path, name: str) -> None:
-    """Each ends as a good file or as an error that names a line; nothing else happens."""
-    data = corpus(shared_dir, name, 8000)
-    used = permissive(load_machine("ender3"))
-    try:
-        _, written = compensate(data, tmp_path, cache, used)
-    except GcodeError as error:
-        refused = error
-    else:
-        check_file(data, written, used)
-        return
-    assert refused.line is not None or "no moves" in str(refused)
-    assert [p.name for p in tmp_path.iterdir()] == ["in.gcode"]
-
-
 @pytest.mark.parametrize(
     "spoilt", ["one piece", "one of a spiral", "every piece", "verbatim lines"]
 )

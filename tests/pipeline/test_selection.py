@@ -29,7 +29,7 @@ def gear(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two layers and a half of the gear: all its features, and no end."""
     lines = GEAR.read_bytes().splitlines(keepends=True)
     path = tmp_path_factory.mktemp("gear") / "gear.gcode"
-    path.write_bytes(tagged(b"".join(lines[:5800])))
+    path.write_bytes(tagged(b"".join(lines[:3100])))
     return path
 
 

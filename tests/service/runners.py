@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 from stillpath.gcode.errors import GcodeError
@@ -55,11 +54,9 @@ def _act(task: Task, progress: Callable[[Progress], None]) -> None:
         raise GcodeError("X1e400 is too large", line=7, text="G1 X1e400")
     if word == "crash":
         raise RuntimeError("a secret of the server")
-    if word == "die" or (word == "die-once" and _first_time(task.source)):
+    if word == "die" or (word == "die-once" and task.attempt == 1):
         os._exit(9)
-    if word == "slow":
-        _take(60.0, progress)
-    if word == "slow-once" and _first_time(task.source):
+    if word == "slow" or (word == "slow-once" and task.attempt == 1):
         _take(60.0, progress)
     if word == "nap":
         _take(float(rest.split()[0]), progress)
@@ -89,18 +86,3 @@ def _grow(size: int, progress: Callable[[Progress], None]) -> None:
     while kept:
         progress(Progress("compensating", 0.5, 10.0, 1.0, 1.0))
         time.sleep(0.02)
-
-
-def _first_time(source: Path) -> bool:
-    """Return whether this source is seen for the first time on this computer."""
-    folder = (
-        Path(os.environ["STILLPATH_TEST_MARKS"])
-        if "STILLPATH_TEST_MARKS" in os.environ
-        else (source.parent)
-    )
-    mark = folder / f"tried-{source.read_text().split()[-1][:60]}"
-    try:
-        mark.touch(exist_ok=False)
-    except FileExistsError:
-        return False
-    return True

@@ -136,7 +136,7 @@ def test_conditions_follow_the_name(client: TestClient) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("what", BROKEN)
+@pytest.mark.parametrize("what", ["same axis twice", "gap", "of nothing known"])
 def test_broken_files_leave_the_store_as_it_was(what: str, client: TestClient, data: Path) -> None:
     files = broken(what)
     before = kept(data)

@@ -13,7 +13,7 @@ import pytest
 from playwright.sync_api import Browser, Playwright, expect, sync_playwright
 
 from tests.missing import tell
-from tests.web.served import GEAR, PATIENCE_MS, Service, running
+from tests.web.served import PART, PATIENCE_MS, Service, running
 from tests.web.visitor import Visitor
 
 _MISSING = "no Chromium: install Debian's package chromium"
@@ -65,7 +65,7 @@ def service(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Itera
 @pytest.fixture(scope="session")
 def gear(service: Service) -> dict[str, Any]:
     """A finished job of a real sliced file."""
-    job = service.finished(service.submit(GEAR.read_bytes(), "gear.gcode"))
+    job = service.finished(service.submit(PART, "gear.gcode"))
     assert job["state"] == "done", job
     return job
 

@@ -15,10 +15,12 @@ from typing import Any
 
 import httpx2
 
-__all__ = ["GEAR", "PATIENCE_MS", "Service", "running"]
+__all__ = ["GEAR", "PART", "PATIENCE_MS", "Service", "running"]
 
 ROOT = Path(__file__).resolve().parents[2]
 GEAR = ROOT / "examples" / "cura_ender3_gear24.gcode"
+PART = GEAR.read_bytes().partition(b";LAYER:9\n")[0]
+"""Its first nine layers."""
 SERVE = [
     sys.executable,
     "-c",

@@ -12,7 +12,7 @@ from playwright.sync_api import Browser, Page, Route, expect
 
 from stillpath.service.api.schemas import JobView
 from stillpath.service.compiling import STAGE
-from tests.web.served import GEAR, Service, running
+from tests.web.served import GEAR, PART, Service, running
 from tests.web.visitor import Visitor
 
 _SECTIONS = (
@@ -45,7 +45,7 @@ def hand_in(page: Page, file: Path, machine: str = "ender") -> None:
 
 def test_an_upload_becomes_a_report(visitor: Visitor, tmp_path: Path):
     file = tmp_path / "wheel.gcode"
-    file.write_bytes(b"; another file\n" + GEAR.read_bytes())
+    file.write_bytes(b"; another file\n" + PART)
     page = visitor.open()
     expect(page.get_by_role("button", name="Compensate")).to_be_disabled()
     hand_in(page, file)
@@ -120,7 +120,7 @@ def test_files_that_cannot_be_meant_are_not_sent(
 
 def test_a_request_that_is_refused_says_why(visitor: Visitor, tmp_path: Path):
     file = tmp_path / "part.gcode"
-    file.write_bytes(GEAR.read_bytes())
+    file.write_bytes(PART)
     visitor.expected = {422}
     page = visitor.open()
     page.locator("form").evaluate("form => { form.noValidate = true; }")
@@ -174,7 +174,7 @@ def test_a_job_is_cancelled_and_deleted(visitor: Visitor, service: Service):
 
 
 def test_the_list_has_pages_and_states(visitor: Visitor, service: Service, gear: dict[str, str]):
-    small = GEAR.read_bytes()[:200]
+    small = PART[:200]
     made = [service.submit(b"; %d\n" % k + small, f"part{k:02}.gcode") for k in range(28)]
     service.finished(made[-1])
     page = visitor.open("#/jobs")
@@ -195,7 +195,7 @@ def test_the_list_has_pages_and_states(visitor: Visitor, service: Service, gear:
 def test_list_page_and_report_say_the_same(
     visitor: Visitor, service: Service, options: dict[str, str]
 ):
-    job = service.finished(service.submit(GEAR.read_bytes(), "gear.gcode", **options))
+    job = service.finished(service.submit(PART, "gear.gcode", **options))
     page = visitor.open("#/jobs")
     row = page.locator(f"[data-job='{job['id']}'] .figures")
     listed = [row.locator(f".{name}").inner_text() for name in ("before", "after")]
@@ -231,7 +231,7 @@ def guarded(browser: Browser, tmp_path_factory: pytest.TempPathFactory):
 
 def test_a_key_is_asked_for_and_goes_along(guarded: Service, visitor: Visitor, tmp_path: Path):
     file = tmp_path / "gear.gcode"
-    file.write_bytes(GEAR.read_bytes())
+    file.write_bytes(PART)
     visitor.expected = {401}
     page = visitor.open(at=guarded.url)
     dialog = page.get_by_role("dialog")

@@ -205,7 +205,7 @@ def test_intervals_cover_the_truth(correlated: bool) -> None:
     """Of many noisy measurements, 95 % intervals hold the truth in about 95 %."""
     plant = modal(TRUTH[:2], (0.75, 0.25))
     scores = []
-    for seed in range(40):
+    for seed in range(20):
         clean = measured(plant, noise=0.0)
         rng = np.random.default_rng(seed)
         n = len(clean.f_hz) + 4

@@ -198,7 +198,7 @@ def test_a_response_that_is_not_1_at_low_frequency(gain: float) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("power", [-2, -1, 1, 2])
+@pytest.mark.parametrize("power", [-2, 1])
 def test_command_and_measurement_of_different_kinds(power: int) -> None:
     plain = response(one_mode(60.0, 0.05))
     derived = replace(plain, response=plain.response * (2j * np.pi * F_HZ) ** power)

@@ -46,7 +46,6 @@ class Site:
         self.settings = Settings(data_dir=data_dir, **settings)  # type: ignore[arg-type]
         self.environment = {
             "STILLPATH_DATA_DIR": str(data_dir),
-            "STILLPATH_TEST_MARKS": str(data_dir),
             "PYTHONPATH": str(ROOT),
             **{f"STILLPATH_{name.upper()}": str(value) for name, value in settings.items()},
         }

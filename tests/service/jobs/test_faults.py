@@ -47,7 +47,7 @@ def worker_pid(site: Site, job_id: str) -> int:
 
 
 def test_a_worker_that_is_killed_costs_its_job_one_attempt(shared: Site):
-    job_id, other = shared.submit("slow-once 1"), shared.submit("G1")
+    job_id, other = shared.submit("slow-once"), shared.submit("G1")
     os.kill(worker_pid(shared, job_id), signal.SIGKILL)
     job = shared.ended(job_id)
     assert (job.state, job.attempt, job.losses) == (JobState.DONE, 2, 1)
@@ -64,7 +64,7 @@ def test_a_job_that_kills_every_worker_fails_and_the_others_go_on(shared: Site):
 
 def test_a_service_that_is_killed_takes_its_workers_along_and_its_jobs_up_again(site: Site):
     with site.work() as first:
-        job_id, waiting = site.submit("slow-once 1"), site.submit("G1")
+        job_id, waiting = site.submit("slow-once"), site.submit("G1")
         site.running(job_id)
         family = first.family()
         first.kill()
@@ -80,7 +80,7 @@ def test_a_service_that_is_killed_takes_its_workers_along_and_its_jobs_up_again(
 @pytest.mark.parametrize("to", ["service", "everybody"])
 def test_a_service_that_is_stopped_gives_its_jobs_back(site: Site, to: str):
     with site.work() as first:
-        job_id = site.submit("slow-once 1")
+        job_id = site.submit("slow-once")
         site.running(job_id)
         family = first.family()
         if to == "everybody":  # as a supervisor does
@@ -116,7 +116,7 @@ def test_a_worker_that_is_deaf_to_a_cancel_is_ended(shared: Site):
 
 
 def test_limits_end_a_job_and_nothing_else(site: Site):
-    with site.work(max_job_s=8.0, cancel_grace_s=1.0, max_job_bytes=250 << 20):
+    with site.work(max_job_s=4.0, cancel_grace_s=1.0, max_job_bytes=250 << 20):
         ids = [site.submit(text) for text in ("deaf", "grow 300", "grow 4000", "G1")]
         long, large, larger, good = (site.ended(job_id) for job_id in ids)
         assert "STILLPATH_MAX_JOB_S" in long.problem["detail"]
@@ -129,7 +129,7 @@ def test_limits_end_a_job_and_nothing_else(site: Site):
 
 def test_silence_is_a_loss(site: Site):
     with site.work(heartbeat_timeout_s=5.0, max_attempts=3):
-        job_id = site.submit("slow-once 1")
+        job_id = site.submit("slow-once")
         pid = worker_pid(site, job_id)
         os.kill(pid, signal.SIGSTOP)  # neither dead nor alive
         until(lambda: site.get(job_id).state is JobState.QUEUED)
