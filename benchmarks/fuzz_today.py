@@ -1,4 +1,4 @@
-"""Fuzzing with a seed of its own every day: damaged excerpts, and files of a grammar.
+"""Fuzzing with a seed of its own every day: damaged excerpts, layers, and files of a grammar.
 
 As `fuzz.py` on each kind of firmware in turn, for some minutes or for a number of files. A failure
 is shown with the seed; with `--seed` it comes again. What fails: anything but a refusal, lines or
@@ -29,6 +29,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from benchmarks.fuzz import attempt
 from tests.fuzz.checks import walk
 from tests.fuzz.grammar import written
+from tests.fuzz.layers import layered
 from tests.fuzz.machines import machine_of
 from tests.fuzz.mutations import excerpts
 
@@ -101,7 +102,9 @@ def _files(dice: random.Random, *, short: bool) -> Iterator[bytes]:
     lengths = (8, 16, 30) if short else (20, 60, 200)
     for data in damaged:
         yield data
-        for _ in range(3 if short else 1):
+        yield layered(dice)
+        # No multiple of three in all: the firmwares take turns.
+        for _ in range(3 if short else 2):
             yield written(dice, dice.choice(lengths))
 
 

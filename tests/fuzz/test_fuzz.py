@@ -16,6 +16,7 @@ from stillpath.gcode.slicers.facts import facts_in
 from tests.fuzz.checks import read_through, through_the_pipeline, walk
 from tests.fuzz.grammar import written
 from tests.fuzz.hostile import HOSTILE, pieces
+from tests.fuzz.layers import layered
 from tests.fuzz.machines import KINDS, machine_of
 from tests.fuzz.mutations import excerpts
 from tests.gcode.states import tagged
@@ -163,6 +164,14 @@ AFTER_DUST = (
     "G1 X138.937 Y110.131 E.06728\nG1\n"
 )
 """The fourth line moves by a rounding error of E, from a place that nobody knows."""
+
+
+@pytest.mark.parametrize(("kind", "seed"), [("klipper", 12), ("marlin", 40), ("marlin", 61)])
+def test_layers_that_repeat_themselves(kind: str, seed: int, tmp_path: Path, cache: Path) -> None:
+    """The last check took lines for earlier ones of the same text, and pieces were reverted."""
+    data = layered(random.Random(seed))
+    _, result = through_the_pipeline(data, machine_of(kind), tmp_path, "shaper:mzv", cache)
+    assert not result.put_back
 
 
 @pytest.mark.slow
