@@ -49,11 +49,12 @@ def pipeline(monkeypatch: pytest.MonkeyPatch) -> types.SimpleNamespace:
         target_npz.write_bytes(b"npz")
         return PlannedTime(12.0, "Slicer", 11.0, ["the file is for Marlin"])
 
-    module = types.ModuleType("stillpath.pipeline.compensate")
-    module.compensate_file = compensate_file
-    module.simulate_file = simulate_file
-    module.plan_file = plan_file
-    monkeypatch.setitem(sys.modules, "stillpath.pipeline.compensate", module)
+    compensating = types.ModuleType("stillpath.pipeline.compensate")
+    compensating.compensate_file = compensate_file
+    simulating = types.ModuleType("stillpath.pipeline.simulate")
+    simulating.simulate_file, simulating.plan_file = simulate_file, plan_file
+    for module in (compensating, simulating):
+        monkeypatch.setitem(sys.modules, module.__name__, module)
     return seen
 
 
