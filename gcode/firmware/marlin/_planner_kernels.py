@@ -86,9 +86,14 @@ def settle(queue: Any, count: int, facts: Any, final: bool) -> int:
         gain2 += 2.0 * row[Q_ACCEL] * row[Q_PATH]
         last = i + ahead - 1
         if last < n - 1:
-            far = queue[blocks[last + 1]]
+            far, end2 = queue[blocks[last + 1]], queue[blocks[last], Q_FLOOR2]
             gain2 -= 2.0 * far[Q_ACCEL] * far[Q_PATH]
-            row[Q_REACH2] = min(row[Q_REACH2], queue[blocks[last], Q_FLOOR2] + gain2)
+            row[Q_REACH2] = min(row[Q_REACH2], end2 + gain2)
+            if far[Q_REACH2] < end2:  # which the firmware does not know yet
+                for j in range(last, i - 1, -1):
+                    one = queue[blocks[j]]
+                    end2 = min(one[Q_JUNCTION2], end2 + 2.0 * one[Q_ACCEL] * one[Q_PATH])
+                row[Q_REACH2] = end2
     return settled
 
 
