@@ -30,6 +30,8 @@ class Task:
         File and folder to be made; the folders above exist.
     cache_dir : Path
         What is worth keeping between jobs.
+    attempt : int
+        Which one it is, from 1.
     """
 
     machine: str
@@ -40,6 +42,7 @@ class Task:
     report: Path
     cache_dir: Path
     kind: JobKind = JobKind.COMPENSATION
+    attempt: int = 1
 
     @property
     def source(self) -> Path:

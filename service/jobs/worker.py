@@ -303,6 +303,7 @@ def _work(job: Job, workplace: Workplace, runner: Runner, watch: Watch, folder: 
                 report=report,
                 cache_dir=cache,
                 kind=job.kind,
+                attempt=job.attempt,
             ),
             watch.tell,
         )
