@@ -67,7 +67,7 @@ share of it below: on a well known machine they would otherwise be the larger er
 _FRICTION_UNSURE = 0.25
 """Relative error of friction identified from logs: often 10 % on virtual printers, seldom 25 %."""
 _STEPS_UNSURE = 0.2
-"""How much more or less than the nominal plants other plants make of whole motor steps."""
+"""How much more or less than the nominal plants other plants make of whole motor steps: a guess."""
 _LAG_UNSURE_S = 1.5e-4
 """Unknown delay of X against Y: alignment sets both to 0, but viscous guides may delay one."""
 _STRIDE = 5
@@ -93,7 +93,7 @@ class Choice:
         By channel of a report, least and largest contour error of the members (delays and all)
         against the nominal plants' with the same command.
     reference_um : dict
-        By channel, the nominal plants' contour error.
+        By channel, the nominal plants' contour error on the reference motion [um].
     """
 
     shares: tuple[float, float]
