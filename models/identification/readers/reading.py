@@ -12,11 +12,13 @@ from stillpath.models.identification.readers.accelerations import (
     read_klipper_log,
     read_m956,
 )
+from stillpath.models.identification.readers.compressed import unpacked
 from stillpath.models.identification.readers.drives import is_drive, read_drives
 from stillpath.models.identification.readers.matlab import is_matlab
 from stillpath.models.identification.readers.model_files import read_json_models, read_matlab_models
 from stillpath.models.identification.readers.responses import is_response, read_responses
 from stillpath.models.identification.readers.settings import ReadSettings, direction_of
+from stillpath.models.identification.readers.shaketune import is_shaketune, read_shaketune
 from stillpath.models.identification.readers.spectra import MOST_BINS, is_spectrum, read_spectrum
 from stillpath.models.identification.readers.tables import Table, as_table, check_size
 from stillpath.models.identification.types import Measurement
@@ -33,9 +35,10 @@ _KLIPPER_NAME = re.compile(
 )
 _ANY_NAME = re.compile(rf"(?:^|[_-])(?:axis[=_-]?)?({_DIRECTION}|[xyz])(?=[_.-]|$)")
 _LOOKED_FOR = (
-    "Klipper's raw log (#time,accel_x,accel_y,accel_z), resonances or calibration data "
-    "(freq,psd_x,...), M956 (Sample,X,Y,Z), a swept sine (time_s,cmd_acc,meas_acc), a frequency "
-    "response (freq_hz, mag or mag_db with phase_deg, or real with imag), JSON and MATLAB models"
+    "Klipper's raw log (#time,accel_x,accel_y,accel_z), Shake&Tune's .stdata, resonances "
+    "or calibration data (freq,psd_x,...), M956 (Sample,X,Y,Z), a swept sine "
+    "(time_s,cmd_acc,meas_acc), a frequency response (freq_hz, mag or mag_db with phase_deg, or real with "
+    "imag), JSON and MATLAB models"
 )
 
 
@@ -73,6 +76,7 @@ def read_content(
 ) -> tuple[Measurement, ...]:
     """Read the content of a file called `name`; see `read_measurements`."""
     settings = settings or ReadSettings()
+    content = unpacked(content, name, LARGEST_BYTES)
     if not content.strip():
         raise ModelError(f"{name}: the file is empty")
     named = _axes_in_name(name)
@@ -97,6 +101,8 @@ def read_content(
 def _from_content(
     content: bytes, name: str, axis: str | None, settings: ReadSettings
 ) -> tuple[Measurement, ...]:
+    if is_shaketune(content):
+        return read_shaketune(content, name, axis, settings)
     is_json = content.lstrip(b"\xef\xbb\xbf \t\r\n")[:1] in (b"{", b"[")
     if (is_json or is_matlab(content)) and len(content) > _LARGEST_MODEL_BYTES:
         raise ModelError(
