@@ -37,8 +37,8 @@ _ANY_NAME = re.compile(rf"(?:^|[_-])(?:axis[=_-]?)?({_DIRECTION}|[xyz])(?=[_.-]|
 _LOOKED_FOR = (
     "Klipper's raw log (#time,accel_x,accel_y,accel_z), Shake&Tune's .stdata, resonances "
     "or calibration data (freq,psd_x,...), M956 (Sample,X,Y,Z), a swept sine "
-    "(time_s,cmd_acc,meas_acc), a frequency response (freq_hz, mag or mag_db with phase_deg, or real with "
-    "imag), JSON and MATLAB models"
+    "(time_s,cmd_acc,meas_acc), a frequency response (freq_hz, mag or mag_db with phase_deg, or "
+    "real with imag), JSON and MATLAB models"
 )
 
 
