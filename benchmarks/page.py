@@ -31,7 +31,7 @@ SECTIONS = (
     "Without changing a move",
     "Print times",
     "Speed and memory",
-    "Hostile files and hands",
+    "Hostile input",
     "Service",
     "Published numbers",
 )
@@ -43,18 +43,18 @@ HEAD = """\
 <!-- Made by benchmarks/page.py from benchmarks/results/*.json: change those, then run it. -->
 
 Every table comes from a script in `benchmarks/`. Run it from the root of a checkout with the
-package installed; `--help` names its options. Shared data is found under `$STILLPATH_SHARED`,
+package installed; `--help` lists its options. Shared data is found under `$STILLPATH_SHARED`,
 `--shared` or `../shared`; any G-code file (also `.gz`) and any machine's JSON document can be given
-instead. A table may show a part of its rows; `benchmarks/results/` has them all, as data.
+instead. A table may show only some of its rows; `benchmarks/results/` has them all, as data.
 
-**No figure here was measured on a printer yet.** The first section is the one of record: plants
+**No figure here was measured on a printer yet.** The first section counts most: plants
 that the design has not seen. What did not work is on [a page of its own](tried.md).
 
-Other figures stand with their subject: [identified models](identification.md#figures),
+Other figures are on the pages of their subjects: [identified models](identification.md#figures),
 [proof prints](proof.md#the-coupon), [a bed that grows heavier](scheduling.md), [ripple](ripple.md),
 [containers](containers.md), [Marlin](marlin.md), [RepRapFirmware](reprapfirmware.md),
 [the filter inside Klipper](klipper-live.md#the-filter), and
-[lines that ask the host something in motion](emission.md#klipper).
+[lines that ask the host something during motion](emission.md#klipper).
 """
 
 Cell = str | int | float | None
