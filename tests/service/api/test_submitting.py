@@ -36,6 +36,16 @@ def test_the_same_file_is_answered_with_the_job_that_is_there(client: TestClient
     assert post(client, b"G1 X12", "&name=a.gcode").status_code == 202
 
 
+def test_parameters_in_the_form_are_not_ignored(client: TestClient, data_dir: Path):
+    before = folders(data_dir)
+    form = {"file": ("a.gcode", b"G1 X13"), "method": (None, "none"), "note": (None, "mine")}
+    refused = client.post("/v1/jobs?machine=ender3", files=form)
+    assert_problem(refused, 422, "method:", "?method=...")
+    assert folders(data_dir) == before
+    del form["method"]
+    assert client.post("/v1/jobs?machine=ender3", files=form).status_code == 202
+
+
 def test_what_failed_is_tried_again(client: TestClient):
     first = post(client, b"bad")
     assert until(client, first.headers["location"], over)["state"] == "failed"
