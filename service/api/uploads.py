@@ -97,7 +97,7 @@ async def receive_upload(request: Request, target: Path, *, max_bytes: int, disk
 
             def begin(name: str) -> Callable[[bytes], None]:
                 if names:
-                    raise broken_form("a job has one file; send each file with a request of its own")
+                    raise broken_form("a job has one file; send each with a request of its own")
                 names.append(name)
                 return sink.take
 
