@@ -141,6 +141,7 @@ def _of_usage(error: typer.TyperException) -> str:
 _REMEDIES = {
     errno.ENOSPC: "make room there, or write to another disk",
     errno.EDQUOT: "make room there, or write to another disk",
+    errno.EFBIG: "its disk, or a limit of this user, takes no larger files: write elsewhere",
     errno.EROFS: "nothing can be written there: take another folder",
     errno.EACCES: "this user may not use it: take another one, or have it allowed",
 }

@@ -118,6 +118,11 @@ def test_a_wrong_field_is_named(
     assert "\n" not in str(raised.value)
 
 
+def test_what_is_no_object_is_told_in_plain_words() -> None:
+    with pytest.raises(ModelError, match=r"must be a JSON object$"):
+        read_machine(b"[1]")
+
+
 def test_a_byte_order_mark_of_windows_is_no_fault(document: dict[str, Any]) -> None:
     plain = json.dumps(document)
     assert read_machine(b"\xef\xbb\xbf" + plain.encode()) == read_machine(plain)

@@ -67,6 +67,18 @@ def test_a_repeated_request_makes_one_job(client: TestClient, data_dir: Path):
     assert post(client, b"G1 X21", "&fresh=true", **other).status_code == 202
 
 
+def test_a_misspelt_filter_does_not_select_everything(client: TestClient):
+    job = post(client, b"G1 X31").json()["id"]
+    refused = client.get("/v1/jobs?batc=mine&limit=5")
+    assert_problem(refused, 422, "batc: is not known here (given: 'mine')")
+    assert [error["name"] for error in refused.json()["errors"]] == ["batc"]
+    assert client.head(f"/v1/jobs/{job}/result?x=1").status_code == 422
+    assert_problem(client.delete(f"/v1/jobs/{job}?dry_run=true"), 422, "dry_run")
+    measured = "/v1/machines/mine/measurements?base=ender3&trail=true"
+    assert_problem(client.post(measured, files={"file": ("a.csv", b"1")}), 422, "trail")
+    assert client.get("/metrics?collector=1").status_code == 200
+
+
 def test_pages_batches_and_states(client: TestClient):
     made = [post(client, f"G1 X{n}".encode(), "&batch=pages").json()["id"] for n in range(5)]
     found: list[str] = []
