@@ -138,11 +138,19 @@ def _of_usage(error: typer.TyperException) -> str:
     return f"{name or parameter.name}: {complaint(refused.errors(include_url=False)[0])}"
 
 
+_REMEDIES = {
+    errno.ENOSPC: "make room there, or write to another disk",
+    errno.EDQUOT: "make room there, or write to another disk",
+    errno.EFBIG: "its disk, or a limit of this user, takes no larger files: write elsewhere",
+    errno.EROFS: "nothing can be written there: take another folder",
+    errno.EACCES: "this user may not use it: take another one, or have it allowed",
+}
+
+
 def _of_system(error: OSError) -> str:
     place = f"{error.filename}: " if error.filename else ""
-    full = error.errno in (errno.ENOSPC, errno.EDQUOT)
-    remedy = "; make room there, or write to another disk" if full else ""
-    return f"{place}{error.strerror or error}{remedy}"
+    remedy = _REMEDIES.get(error.errno or 0)
+    return f"{place}{error.strerror or error}{f'; {remedy}' if remedy else ''}"
 
 
 def _fail(message: str, code: int) -> int:

@@ -132,7 +132,7 @@ def _dwell(w: Any, mask: int, f: Any, i: Any, rows: Any) -> int:
         seconds = w[_P] / 1000.0
         given = True
     if not 0.0 <= seconds <= MAX_VALUE:
-        f[F_ERROR] = seconds
+        f[F_ERROR] = w[_S] if mask & (1 << _S) and i[I_DWELL_RULE] != _P_ONLY else w[_P]
         return ERROR_POSITIVE
     if i[I_DWELL_RULE] == _OR_NOTHING and not given:
         put_event(i, rows, _HARMLESS)

@@ -31,6 +31,9 @@ _MUST = {
     "too_long": "must have at most {max_length} entries",
     "date_from_datetime_parsing": "must be a day like 2026-03-02",
     "date_parsing": "must be a day like 2026-03-02",
+    "dict_type": "must be a JSON object",
+    "model_type": "must be a JSON object",
+    "model_attributes_type": "must be a JSON object, sent as application/json",
     "missing": "is missing",
     "extra_forbidden": "is not known here",
 }
@@ -72,7 +75,7 @@ def complaint(entry: Mapping[str, Any], *, repeat: bool = True) -> str:
         words = str(entry.get("msg", "cannot be used")).removeprefix("Value error, ")
         words = re.sub(r"^\w+ should\b", "must", words)
     given = entry.get("input")
-    if not repeat or kind == "missing" or isinstance(given, dict | list | tuple):
+    if not repeat or kind == "missing" or isinstance(given, dict | list | tuple | bytes):
         return words
     text = _number(given) if isinstance(given, float) else repr(given)
     return f"{words} (given: {text if len(text) <= _SHOWN else f'{text[:_SHOWN]}...'})"

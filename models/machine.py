@@ -11,7 +11,7 @@ import json
 import math
 from typing import Annotated, Literal, TypeVar
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from stillpath.models.confirmation import Confirmation
 from stillpath.models.document import Document, Finite, NonNegative, Positive
@@ -33,6 +33,25 @@ __all__ = [
 
 _Part = TypeVar("_Part", bound=Document)
 
+_FASTEST_MM_S, _STRONGEST_MM_S2 = 1e5, 1e7
+"""Ten times what the fastest machines reach; with far larger limits no motion can be computed."""
+
+
+def _up_to(most: float, unit: str) -> AfterValidator:
+    def check(value: float) -> float:
+        if value > most:
+            raise ValueError(
+                f"{value:g} {unit} is more than any motor bears; state what yours do, at most "
+                f"{most:g} {unit}, or leave it out"
+            )
+        return value
+
+    return AfterValidator(check)
+
+
+_Speed = Annotated[Positive, _up_to(_FASTEST_MM_S, "mm/s")]
+_Accel = Annotated[Positive, _up_to(_STRONGEST_MM_S2, "mm/s2")]
+
 
 class AxisTravel(Document):
     """Where an axis may go; no emitted coordinate lies outside."""
@@ -50,16 +69,16 @@ class AxisTravel(Document):
 class AxisLimits(Document):
     """What an axis bears, where it is more than `CommandLimits` says of both; None: the same."""
 
-    velocity_mm_s: Positive | None = None
-    accel_mm_s2: Positive | None = None
-    speed_step_mm_s: Positive | None = None
+    velocity_mm_s: _Speed | None = None
+    accel_mm_s2: _Accel | None = None
+    speed_step_mm_s: _Speed | None = None
 
 
 class MotorLimits(Document):
     """What each motor of a CoreXY bears of x + y, or x - y; None: as much as both axes ask."""
 
-    velocity_mm_s: Positive | None = None
-    accel_mm_s2: Positive | None = None
+    velocity_mm_s: _Speed | None = None
+    accel_mm_s2: _Accel | None = None
 
 
 class CommandLimits(Document):
@@ -73,9 +92,9 @@ class CommandLimits(Document):
     held to less than their sum (`motors`).
     """
 
-    velocity_mm_s: Positive = 500.0
-    accel_mm_s2: Positive = 20_000.0
-    speed_step_mm_s: Positive = 45.0
+    velocity_mm_s: _Speed = 500.0
+    accel_mm_s2: _Accel = 20_000.0
+    speed_step_mm_s: _Speed = 45.0
     """Largest step of a motor's speed within a ms, from one straight segment to the next."""
     axes: dict[Literal["x", "y"], AxisLimits] = Field(default_factory=dict)
     motors: MotorLimits | None = None

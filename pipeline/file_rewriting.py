@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import errno
+import os
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -58,7 +60,9 @@ def file_rewriting(
     GcodeError
         The container is damaged, or cannot be what the target is called.
     OSError
+        Also when another program changes the source before the target is in place.
     """
+    began = source.stat()
     unpacking = progress_to(progress, "unpacking", 0.0)
     packing = progress_to(progress, "packing", 1.0)
     with (
@@ -76,5 +80,18 @@ def file_rewriting(
             made = FileRewriting(container, text, spool, writer)
             yield made
         # Before the target is put in place: it may be the source.
-        made.sizes["original_bytes"] = source.stat().st_size
+        _check_unchanged(source, began)
+        made.sizes["original_bytes"] = began.st_size
         made.sizes["written_bytes"] = temporary.stat().st_size
+
+
+def _check_unchanged(source: Path, began: os.stat_result) -> None:
+    """Refuse to mix what was read with what is there now, or to replace what nobody read."""
+    now = source.stat()
+    if (now.st_size, now.st_mtime_ns) != (began.st_size, began.st_mtime_ns):
+        raise OSError(
+            errno.EBUSY,
+            "another program changed the file while it was processed, so nothing was written; "
+            "run it again",
+            str(source),
+        )

@@ -70,7 +70,11 @@ def replacing(target: Path) -> Iterator[Path]:
 
 def _named(target: Path) -> Path:
     prefix = f".{target.name[:_NAME_PART]}."
-    handle, name = tempfile.mkstemp(dir=target.parent, prefix=prefix, suffix=".part")
+    try:
+        handle, name = tempfile.mkstemp(dir=target.parent, prefix=prefix, suffix=".part")
+    except OSError as error:
+        error.filename = str(target.parent)  # nobody knows the temporary file
+        raise
     os.close(handle)
     return Path(name)
 

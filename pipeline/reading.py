@@ -81,8 +81,8 @@ def doubts(file: BinaryIO, machine: Machine, name: DialectName | None = None) ->
     why = "; ".join(found.reasons)
     text = (
         f"the file looks as if it were written for {found.dialect} ({why}), and {machine.name} "
-        f"reads it as {own.title} does: slice for {own.title}, or say --dialect {own.name} if "
-        "that is what it is"
+        f"reads it as {own.title} does: slice for {own.title}, or say that "
+        f"it is written for {own.title} (dialect {own.name})"
     )
     return [text]
 

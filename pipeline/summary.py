@@ -140,5 +140,5 @@ class Summary:
             yield (
                 f"{SHAPER_IS_BETTER}: {self.shaper.label} alone would leave {um_text(shaper)} um "
                 f"rms of contour error, this file {um_text(ours)} um. "
-                "Print it as sliced with that shaper, or let --method advise write the commands"
+                "Print it as sliced with that shaper, or let method advise write the commands"
             )

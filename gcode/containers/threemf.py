@@ -30,6 +30,7 @@ __all__ = ["ThreeMf"]
 _PLATE = re.compile(r"Metadata/plate_([1-9]\d{0,3})\.gcode")
 _SLICE_INFO = "Metadata/slice_info.config"
 _LARGEST_INFO_BYTES = 1 << 22
+_DIGEST = re.compile(rb"\s*([0-9A-Fa-f]{32})")
 _LARGEST_DIGEST_BYTES = 1 << 10
 _COPY_BYTES = 1 << 20
 _MOST_MEMBERS = 10_000
@@ -83,10 +84,13 @@ class ThreeMf:
             _check(archive, largest_unpacked(source))
             self._name = _chosen(archive.namelist(), plate)
             size = max(archive.getinfo(self._name).file_size, 1)
+            digest = hashlib.md5(usedforsecurity=False)
             with archive.open(self._name) as member:
                 while data := member.read(_COPY_BYTES):
                     text.write(data)
+                    digest.update(data)
                     progress(member.tell() / size)
+            _check_digest(archive, f"{self._name}.md5", digest.hexdigest())
 
     def write(self, text: BinaryIO, target: BinaryIO, progress: Callable[[float], None]) -> None:
         """Write a package around a text; its other members and plates are kept as they are."""
@@ -195,12 +199,26 @@ def _chosen(names: list[str], plate: int | None) -> str:
         if len(plates) > 1:
             raise GcodeError(
                 f"the package holds several sliced plates ({listed}): say which one to work on "
-                "(--plate N, or plate=N over HTTP); the others stay as they are"
+                "(option plate); the others stay as they are"
             )
         (plate,) = plates
     if plate not in plates:
         raise GcodeError(f"the package holds no sliced plate {plate}; there is {listed}")
     return plates[plate]
+
+
+def _check_digest(archive: zipfile.ZipFile, name: str, digest: str) -> None:
+    """Refuse G-code that is not what the package's MD5 belongs to: ours would hide that."""
+    if name not in archive.namelist():
+        return
+    with archive.open(name) as member:
+        told = _DIGEST.match(member.read(_LARGEST_DIGEST_BYTES))
+    if told is not None and told[1].lower() != digest.encode():
+        raise GcodeError(
+            f"the 3MF package's {name} says {told[1].decode().lower()}, and the MD5 of the plate "
+            f"is {digest}: something changed the G-code after it was sliced, and a printer may "
+            "refuse the package; export the sliced file again"
+        )
 
 
 def _retimed(info: bytes, name: str, delay_s: float) -> bytes:
@@ -249,7 +267,7 @@ def _like(info: zipfile.ZipInfo, size: int) -> zipfile.ZipInfo:
 
 def _renewed(old: bytes, digest: str) -> bytes:
     """Return the digest in the form of the old one; after it, say a line end is kept."""
-    form = re.match(rb"\s*([0-9A-Fa-f]{32})", old)
+    form = _DIGEST.match(old)
     lower = form is not None and form[1] != form[1].upper()
     made = digest if lower else digest.upper()
     return made.encode("ascii") + (old[form.end() :] if form else b"")

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import errno
 import http.client
 import json
 import os
@@ -50,6 +51,8 @@ _SETTINGS = ("server", "key", "machine", "method", "reports", "log", "on_error",
 # What slicers call a printer, the most particular name first.
 _PRINTER_NAMES = ("PHYSICAL_PRINTER_SETTINGS_ID", "PRINTER_SETTINGS_ID", "PRINTER_MODEL")
 _SUFFIXES = (".gcode.3mf", ".gcode", ".bgcode", ".gco", ".g")
+_FOLDER = "stillpath-post-"
+_LEFT_S = 7 * 86400.0  # nobody waits for a file that long
 _SHOWN_EVERY_S, _SAID_EVERY_S = 0.1, 5.0  # on a terminal, elsewhere
 
 
@@ -155,7 +158,8 @@ def _on_server(path: Path, options: dict[str, Any], settings: Settings, voice: V
     before = path.stat()
     client = Service(settings.server, settings.key, settings.timeout, voice.progress)
     # Who is killed while he waits or fetches leaves nothing beside the file.
-    with tempfile.TemporaryDirectory(prefix="stillpath-") as folder:
+    _delete_leftovers()
+    with tempfile.TemporaryDirectory(prefix=_FOLDER) as folder:
         fetched = Path(folder) / "result"
         page = client.compensate(path, fetched, options, settings.wait)
         with replacing(path) as temporary:
@@ -164,6 +168,14 @@ def _on_server(path: Path, options: dict[str, Any], settings: Settings, voice: V
             if (now.st_size, now.st_mtime_ns) != (before.st_size, before.st_mtime_ns):
                 raise Failure(f"{path} was changed by somebody else while it was processed", 1)
     return page
+
+
+def _delete_leftovers() -> None:
+    """Delete the temporary folders of runs that were killed."""
+    for left in Path(tempfile.gettempdir()).glob(f"{_FOLDER}*"):
+        with contextlib.suppress(OSError):
+            if time.time() - left.lstat().st_mtime > _LEFT_S:
+                shutil.rmtree(str(left))
 
 
 def _write_report(page: bytes, job: PrintJob, settings: Settings, voice: Voice) -> None:
@@ -871,7 +883,8 @@ def _unquoted(text: str) -> str:
 
 def _of_system(error: OSError) -> str:
     place = f"{error.filename}: " if error.filename else ""
-    return f"{place}{error.strerror or error}"
+    remedy = "; make room there" if error.errno == errno.ENOSPC else ""
+    return f"{place}{error.strerror or error}{remedy}"
 
 
 if __name__ == "__main__":

@@ -129,7 +129,7 @@ def check_pair(x: ArrayLike, y: ArrayLike) -> None:
         raise ModelError(
             f"the logs of X and Y both show motion along the sensor direction {_vector(x)}: the "
             "same axis was measured twice, so measure the other one; if the sensor was turned "
-            "between the tests, say so (--sensor-turned)"
+            "between the tests, say so (option sensor_turned)"
         )
 
 

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
 
-from fastapi import FastAPI
+from fastapi import Depends, FastAPI
 from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import State
 
@@ -39,6 +39,7 @@ from stillpath.service.api.guard import Guard, hosts_of
 from stillpath.service.api.hub import Hub
 from stillpath.service.api.intake import Intake
 from stillpath.service.api.limits import Limits
+from stillpath.service.api.parameters import refuse_unknown_parameters
 from stillpath.service.api.proxies import Proxies
 from stillpath.service.database.documents import open_documents
 from stillpath.service.database.engine import open_database
@@ -145,11 +146,15 @@ def _include_routes(app: FastAPI) -> None:
         identifications,
         controllers,
         printers,
-        octoprint,
         keys,
-        metrics,
     ):
-        app.include_router(part.router, responses=problems.responses(401, 403, 422, 429, 503))
+        app.include_router(
+            part.router,
+            dependencies=[Depends(refuse_unknown_parameters)],
+            responses=problems.responses(401, 403, 422, 429, 503),
+        )
+    for others in (octoprint, metrics):  # what slicers and collectors add is theirs
+        app.include_router(others.router, responses=problems.responses(401, 403, 422, 429, 503))
 
 
 async def _open(app: FastAPI, settings: Settings, runner: Runner, stack: AsyncExitStack) -> None:

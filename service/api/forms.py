@@ -31,7 +31,7 @@ def is_form(request: Request) -> bool:
 async def read_form(
     request: Request,
     body: AsyncIterable[bytes],
-    begin: Callable[[str], Take | None],
+    begin: Callable[[str], Take],
     drain: Callable[[], Awaitable[None]],
 ) -> dict[str, str]:
     """Read a form; return its fields that are no files.
@@ -42,7 +42,7 @@ async def read_form(
     body : async iterable
         Its chunks.
     begin : callable
-        Is called with the name of each file that begins; returns what takes its bytes, or None.
+        Is called with the name of each file that begins; returns what takes its bytes.
     drain : callable
         Is awaited after each chunk: what was taken is to be written.
 
@@ -77,7 +77,7 @@ def broken_form(why: str) -> Problem:
 class _Form:
     """Callbacks of the multipart parser."""
 
-    def __init__(self, begin: Callable[[str], Take | None]) -> None:
+    def __init__(self, begin: Callable[[str], Take]) -> None:
         self.fields: dict[str, str] = {}
         self.is_whole = False
         self._begin = begin

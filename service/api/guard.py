@@ -13,7 +13,7 @@ from urllib.parse import urlsplit
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from stillpath.service.api.limits import limited_receive, too_long
+from stillpath.service.api.limits import limited_receive, unreadable
 from stillpath.service.api.problems import Problem, problem_response
 from stillpath.service.settings import Settings, is_loopback
 
@@ -80,7 +80,7 @@ class Guard:
                 _complete(MutableHeaders(scope=message))
             await send(message)
 
-        refused = too_long(scope) or self._refusal(scope)
+        refused = unreadable(scope) or self._refusal(scope)
         if refused is None:
             await self._app(scope, limited_receive(scope, receive), sent)
         else:

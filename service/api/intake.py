@@ -383,7 +383,18 @@ class Intake:
 
 
 def _with_fields(wanted: JobQuery, upload: Upload) -> JobQuery:
-    """Take `print` of a form, which is how printers' own APIs are told so."""
+    """Take `print` of a form, which is how printers' own APIs are told so.
+
+    Other parameters in the form are refused: they would be ignored without a word.
+    """
+    misplaced = sorted((upload.fields.keys() & JobQuery.model_fields.keys()) - {"print"})
+    if misplaced:
+        raise Problem(
+            422,
+            "Invalid parameter",
+            f"{', '.join(misplaced)}: parameters belong in the address (?{misplaced[0]}=...), and "
+            "the form holds the file alone.",
+        )
     if upload.fields.get("print", "").strip().lower() in ("true", "1", "yes", "on"):
         return wanted.model_copy(update={"print": True})
     return wanted

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 
 from stillpath.service.api.body_timeout import BODY_TIMEOUT, BodyTimeout
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 
     from stillpath.service.security.callers import Caller
 
-__all__ = ["COUNTED", "Limits", "limited_receive", "name_of", "too_long"]
+__all__ = ["COUNTED", "Limits", "limited_receive", "name_of", "unreadable"]
 
 COUNTED = "stillpath.body_counted"
 """Key of the ASGI scope that a route sets which counts the bytes of its body itself."""
@@ -141,8 +142,8 @@ def name_of(caller: Caller) -> str:
     return f"key {caller.key_id}" if caller.key_id is not None else _network(caller.remote)
 
 
-def too_long(scope: Scope) -> Problem | None:
-    """Return what is wrong with the size of a request's first lines, if anything is."""
+def unreadable(scope: Scope) -> Problem | None:
+    """Return what is wrong with a request's first lines: their size, or an encoded body."""
     url_bytes = len(scope.get("raw_path") or b"") + len(scope.get("query_string", b""))
     if url_bytes > _LONGEST_URL_BYTES:
         return Problem(
@@ -158,6 +159,15 @@ def too_long(scope: Scope) -> Problem | None:
             "Headers too large",
             f"The request has {len(headers)} headers of {size_bytes} bytes together; the limits "
             f"are {_MOST_HEADERS} and {_LARGEST_HEADERS_BYTES}.",
+        )
+    encoding = Headers(scope=scope).get("content-encoding", "identity")
+    if encoding.strip().lower() not in ("", "identity"):
+        return Problem(
+            415,
+            "Encoded body",
+            f"The body comes with Content-Encoding {encoding[:80]!r}, which is not decoded here: "
+            "send it as it is.",
+            headers={"Accept-Encoding": "identity", "Connection": "close"},
         )
     return None
 

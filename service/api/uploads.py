@@ -72,7 +72,7 @@ async def receive_upload(request: Request, target: Path, *, max_bytes: int, disk
     Parameters
     ----------
     request : Request
-        For multipart, the first part with a file name counts; other files are ignored.
+        For multipart, one part has a file name.
     target : Path
         Is left incomplete when an error is raised; the caller deletes it. Nothing is synced:
         what stores the file for good does that.
@@ -95,9 +95,11 @@ async def receive_upload(request: Request, target: Path, *, max_bytes: int, disk
         if is_form(request):
             names: list[str] = []
 
-            def begin(name: str) -> Callable[[bytes], None] | None:
+            def begin(name: str) -> Callable[[bytes], None]:
+                if names:
+                    raise broken_form("a job has one file; send each with a request of its own")
                 names.append(name)
-                return sink.take if len(names) == 1 else None
+                return sink.take
 
             body = limited_body(request, max_bytes)
             fields = await read_form(request, body, begin, sink.drain)

@@ -189,6 +189,8 @@ def test_bad_inputs(pipeline, tmp_path, capsys, name):
         (GcodeError("X is no number", line=7, text="G1 Xnan"), 2, ["line 7", "G1 Xnan"]),
         (DesignError("n is too large"), 2, ["n is too large"]),
         (OSError(28, "No space left on device"), 1, ["No space left"]),
+        (OSError(errno.EROFS, "Read-only file system", "/x"), 1, ["another folder"]),
+        (OSError(errno.EACCES, "Permission denied", "/x"), 1, ["/x: Perm", "allowed"]),
         (MemoryError(), 1, ["memory"]),
         (KeyboardInterrupt(), 130, ["interrupted"]),
     ],

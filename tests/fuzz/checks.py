@@ -1,7 +1,7 @@
 """What must hold for any bytes: what one file may do to interpreter, planner and pipeline.
 
 Nothing but a `GcodeError` may come out, and what comes out of the pipeline holds every line of the
-file, with the machine in the same state at each of them.
+file, with the machine in the same state at each of them. No piece is reverted for an error of ours.
 """
 
 from __future__ import annotations
@@ -46,8 +46,6 @@ class Outcome:
     written: bytes | None
     """None: refused as a whole."""
     put_back: int = 0
-    internal: tuple[str, ...] = ()
-    """Why pieces were reverted for an error of our own."""
     cpu_s: float = 0.0
     """CPU time of reading it, and of the longest run: it runs again without each refused line."""
 
@@ -69,13 +67,14 @@ def walk(data: bytes, machine: Machine, folder: Path, method: str, cache: Path) 
     # Ends of lines other than LF and CRLF are the interpreter's business alone.
     if b"\r" not in text.replace(b"\r\n", b"\n"):
         text = _tagged(text)
-    written, put_back, internal = None, 0, ()
+    written, put_back = None, 0
     for _ in range(8):
         began = time.process_time()
         try:
             written, result = through_the_pipeline(text, machine, folder, method, cache)
             put_back = len(result.put_back)
-            internal = tuple(p.reason for p in result.put_back if "internal error" in p.reason)
+            for piece in result.put_back:
+                assert "internal error" not in piece.reason, piece.reason
             break
         except GcodeError as error:
             refusals.append(error)
@@ -85,7 +84,7 @@ def walk(data: bytes, machine: Machine, folder: Path, method: str, cache: Path) 
         finally:
             runs_s.append(time.process_time() - began)
     cpu_s = reading_s + max(runs_s)
-    return Outcome(text, refusals, written, put_back, internal, cpu_s)
+    return Outcome(text, refusals, written, put_back, cpu_s)
 
 
 def read_through(data: bytes, machine: Machine) -> GcodeError | None:

@@ -13,6 +13,7 @@ from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.slicers.facts import facts_in
+from stillpath.pipeline.piece_compensator import PieceCompensator
 from tests.fuzz.checks import read_through, through_the_pipeline, walk
 from tests.fuzz.grammar import written
 from tests.fuzz.hostile import HOSTILE, pieces
@@ -30,6 +31,18 @@ def test_damage_is_the_seed_s() -> None:
     assert made[0] == made[1]
     assert made[0] != made[2]
     assert 30_000 <= sum(map(len, made[0])) < 100_000
+
+
+def test_a_piece_reverted_for_an_error_of_ours_is_a_failure(
+    tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def faulty(*_: object) -> None:
+        raise IndexError("index 3 is out of bounds")
+
+    monkeypatch.setattr(PieceCompensator, "compensate", faulty)
+    square = b"G28\nM83\nG1 X50 Y50 F6000\nG1 X90 E1\nG1 Y90 E1\nG1 X50 E1\n"
+    with pytest.raises(AssertionError, match="internal error"):
+        walk(square, machine_of("klipper"), tmp_path, "shaper:mzv", cache)
 
 
 @pytest.mark.parametrize("kind", KINDS)

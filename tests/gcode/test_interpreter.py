@@ -146,7 +146,7 @@ def test_quarter_arc_and_circle(golden_machine: Machine) -> None:
         ("G2 X5 I100000000", "pieces"),
         ("M220 S0", "above 0"),
         ("M204 S-5", "above 0"),
-        ("G4 P-1", "P of G4"),
+        ("G4 P-5", "value -5 is .*P of G4"),
         ("RESTORE_GCODE_STATE NAME=none", "SAVE_GCODE_STATE"),
         ("SET_VELOCITY_LIMIT ACCEL=0", "above 0"),
         ("SET_VELOCITY_LIMIT ACCEL=nan", "out of range"),

@@ -122,6 +122,18 @@ def test_packages_that_are_refused(tmp_path: Path):
     refused(bytes(file), tmp_path, "cannot be read .*encrypted")
 
 
+def test_a_text_that_is_not_what_the_digest_says_is_refused(tmp_path: Path):
+    file = package({1: TEXT, 2: NEW})
+    changed = io.BytesIO()
+    with zipfile.ZipFile(changed, "w") as archive:
+        for name, content in members(file).items():
+            archive.writestr(name, b"G1 X9\n" + content if name.endswith("1.gcode") else content)
+    right, other = (hashlib.md5(data).hexdigest() for data in (TEXT, b"G1 X9\n" + TEXT))
+    words = f"plate_1.gcode.md5 says {right}, and .*{other}.*export the sliced file again"
+    refused(changed.getvalue(), tmp_path, words, plate=1)
+    assert text_of(changed.getvalue(), tmp_path, plate=2) == NEW
+
+
 def test_what_stands_beside_a_plate_may_be_long_or_endless(tmp_path: Path):
     info = b"<plate>" * 300_000 + b'<metadata key="index" value="1"/>'
     beside = {"Metadata/slice_info.config": info, "Metadata/plate_2.gcode.md5": b" " * 5_000_000}
@@ -130,7 +142,8 @@ def test_what_stands_beside_a_plate_may_be_long_or_endless(tmp_path: Path):
     assert {name: made[name] for name in beside} == beside
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        digest = {"Metadata/plate_1.gcode.md5": b"0" * 32 + b" " * 5_000_000}
+        sliced = hashlib.md5(TEXT, usedforsecurity=False).hexdigest().upper().encode()
+        digest = {"Metadata/plate_1.gcode.md5": sliced + b" " * 5_000_000}
         plate = io.BytesIO()
         with zipfile.ZipFile(plate, "w") as archive:
             archive.writestr("Metadata/plate_1.gcode", TEXT)

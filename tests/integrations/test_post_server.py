@@ -11,6 +11,7 @@ import stat
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -210,6 +211,18 @@ def test_being_stopped(running: Running, part: Path, tmp_path: Path, number: int
 
 
 @pytest.mark.skipif(os.name != "posix", reason="limits the size of files")
+def test_what_a_killed_run_left_is_deleted(running: Running, part: Path, tmp_path: Path):
+    folder = tmp_path / "temporary"
+    for name, days in (("stillpath-post-old", 8), ("stillpath-post-new", 6), ("other", 8)):
+        (folder / name).mkdir(parents=True)
+        (folder / name / "result").write_bytes(b"G1 X1")
+        at = time.time() - days * 86400
+        os.utime(folder / name, (at, at))
+    done = post(*running.arguments, part, home=tmp_path, TMPDIR=str(folder))
+    assert done.returncode == 0, done.stderr
+    assert sorted(path.name for path in folder.iterdir()) == ["other", "stillpath-post-new"]
+
+
 def test_a_full_disk(running: Running, part: Path, tmp_path: Path):
     content = TEXT * 200
     part.write_bytes(content)

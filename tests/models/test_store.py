@@ -100,6 +100,8 @@ def test_unknown_names_and_files(tmp_path: Path) -> None:
         (("axes", "x", "members", 1, "weight"), -2, r"members\..*\.1\.weight"),
         (("firmware", "planner", "max_accel_mm_s2"), float("nan"), "max_accel_mm_s2: .*finite"),
         (("command", "accel_mm_s2"), 0, "accel_mm_s2: must be more than 0 mm"),
+        (("command", "accel_mm_s2"), 1e12, r"accel_mm_s2: 1e\+12 mm/s2 is more .* at most 1e\+07"),
+        (("command", "velocity_mm_s"), 1e9, r"command.velocity_mm_s: .*at most 100000 mm/s"),
         (("surprise",), 1, "surprise: is not known here"),
     ],
 )
@@ -114,6 +116,11 @@ def test_a_wrong_field_is_named(
         read_machine(json.dumps(document), "mine.json")
     assert str(raised.value).startswith("mine.json: ")
     assert "\n" not in str(raised.value)
+
+
+def test_what_is_no_object_is_told_in_plain_words() -> None:
+    with pytest.raises(ModelError, match=r"must be a JSON object$"):
+        read_machine(b"[1]")
 
 
 def test_a_byte_order_mark_of_windows_is_no_fault(document: dict[str, Any]) -> None:

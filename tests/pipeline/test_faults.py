@@ -10,6 +10,7 @@ from stillpath.models.store import load_machine
 from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.piece_compensator import PieceCompensator
+from stillpath.pipeline.progress import Progress
 from tests.pipeline.test_compensate import check_file
 
 HEAD = "G28\nM83\nG90\nG1 X50 Y50 Z0.2 F6000\n"
@@ -40,6 +41,27 @@ def test_a_fault_of_ours_costs_one_piece(
     assert fault.reason.startswith(f"line {fault.line_first}:")
     assert len(calls) > 2
     check_file(data, target.read_bytes(), machine)
+
+
+@pytest.mark.parametrize("method", ["fbf", "advise"])
+def test_a_file_that_is_replaced_meanwhile_stays(method: str, tmp_path: Path, cache: Path) -> None:
+    source = tmp_path / "in.gcode"
+    source.write_text(HEAD + 3 * (SQUARE + STOP))
+
+    def replace(_: Progress) -> None:
+        again = tmp_path / "again.gcode"
+        again.write_text("; sliced again\n")
+        again.replace(source)
+
+    with pytest.raises(OSError, match=r"another program changed .* run it again") as caught:
+        compensate_file(
+            *(source, source, load_machine("ender3"), Options.model_validate({"method": method})),
+            cache_dir=cache,
+            progress=replace,
+        )
+    assert caught.value.filename == str(source)
+    assert source.read_text() == "; sliced again\n"
+    assert [path.name for path in tmp_path.iterdir() if path.is_file()] == ["in.gcode"]
 
 
 @pytest.mark.parametrize("name", ["ender3", "generic-corexy"])

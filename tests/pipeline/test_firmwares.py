@@ -148,6 +148,7 @@ def test_a_file_for_another_firmware_is_doubted(tmp_path: Path, cache: Path) -> 
     (warning,) = plan_file(source, motion, marlin).warnings
     assert "written for reprapfirmware (gcode_flavor = reprapfirmware; " in warning
     assert "ender3 reads it as Marlin does" in warning
+    assert "--" not in warning
     assert plan_file(source, motion, marlin, dialect="marlin").warnings == []
     assert plan_file(source, motion, machine_with("reprapfirmware")).warnings == []
     assert simulate_file(source, marlin, cache_dir=cache).warnings[0] == warning

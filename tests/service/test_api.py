@@ -151,6 +151,8 @@ def test_empty_large_and_broken_uploads_leave_nothing(client: TestClient, data_d
     form = {"content-type": "multipart/form-data; boundary=abc"}
     part = b'--abc\r\nContent-Disposition: form-data; name="file"; filename="a"\r\n\r\nG1 X1'
     assert_problem(client.post(JOBS, content=part, headers=form), 422, "last boundary")
+    two = [("file", ("a.gcode", b"G1 X1")), ("file", ("b.gcode", b"G1 X2"))]
+    assert_problem(client.post(JOBS, files=two), 422, "one file", "a request of its own")
     long = {"note": "x" * 5000, "file": ("a.gcode", b"G1")}
     answer = client.post(JOBS, files={k: v if k == "file" else (None, v) for k, v in long.items()})
     assert_problem(answer, 422, "4096 bytes")

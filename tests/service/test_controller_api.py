@@ -101,6 +101,12 @@ def test_a_disturbance_without_end(client: TestClient) -> None:
     assert_problem(client.post(WHERE, json=FMSDOB | {"disturbance": slow}), 422, "0.001 Hz")
 
 
+def test_options_that_are_not_sent_as_json(client: TestClient) -> None:
+    sent = client.post(WHERE, content=b'{"method": "fmsdob"}')
+    document = assert_problem(sent, 422, "a JSON object, sent as application/json")
+    assert "fmsdob" not in document["detail"]
+
+
 def test_no_file_is_reached(client: TestClient, tmp_path: Path) -> None:
     file = tmp_path / "x.json"
     file.write_text(load_loop("galvo-40khz").model_dump_json())

@@ -138,7 +138,8 @@ def test_warnings_name_the_controls_of_the_page(visitor: Visitor, tmp_path: Path
     page.get_by_label("Compensate", exact=True).select_option("walls")
     expect(page.get_by_label("File is written for")).to_be_visible()
     hand_in(page, file)
-    expect(page.get_by_text("choose klipper under “File is written for”")).to_be_visible()
+    told = "written for Klipper (“File is written for”)"
+    expect(page.get_by_text(told)).to_be_visible()
     expect(page.get_by_text("“Compensate: Outer walls”: ")).to_be_visible()
     assert "--" not in page.locator("main").inner_text()
 

@@ -51,7 +51,7 @@ class KlipperAdapter:
             f"(firmware.planner.max_z_accel_mm_s2 = "
             f"{self._firmware.planner.max_z_accel_mm_s2:g}); a command may ask for "
             f"{needed:.0f} (command.{stated}): level the bed, raise max_z_accel in printer.cfg "
-            f"and here to {least:.0f}, or lower command.{stated}. Or use --method advise, which "
+            f"and here to {least:.0f}, or lower command.{stated}. Or use method advise, which "
             "leaves all moves as they are and sets the firmware's own shaper."
         )
 

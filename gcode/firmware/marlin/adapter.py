@@ -37,7 +37,7 @@ quarter of it, and a stand in the middle of a stretch is crossed by half of it (
 _ACCELERATIONS = ("accel_x_mm_s2", "accel_y_mm_s2", "print_accel_mm_s2", "travel_accel_mm_s2")
 
 _ALTERNATIVE = (
-    "use --method advise, which sets accelerations, and the firmware's own input shaper where the "
+    "use method advise, which sets accelerations, and the firmware's own input shaper where the "
     "machine states one"
 )
 
@@ -65,7 +65,7 @@ class MarlinAdapter:
         if firmware.variant == "bambu":
             return (
                 "Bambu's firmware is closed: how it plans a stream is not known; it compensates "
-                "itself (M975 S1), and --method advise sets accelerations beside that"
+                "itself (M975 S1), and method advise sets accelerations beside that"
             )
         if firmware.variant == "prusa":
             return (
@@ -82,7 +82,7 @@ class MarlinAdapter:
             return (
                 "fixed-time motion (ft_motion, M493) has a planner of its own, which would smooth "
                 "a stream; build without FT_MOTION, or switch it off (M493 S0) and say so in "
-                "`ft_motion`, or use --method advise, which sets its shaper (M493)"
+                "`ft_motion`, or use method advise, which sets its shaper (M493)"
             )
         if firmware.board == "avr":
             return (

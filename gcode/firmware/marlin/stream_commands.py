@@ -106,7 +106,7 @@ class MarlinStreamCommands:
             return None
         return (
             "M493 sets fixed-time motion, whose planner and shapers would work on top of the "
-            "compensation; take it out of the start code (M493 S0 is fine), or use --method advise"
+            "compensation; take it out of the start code (M493 S0 is fine), or use method advise"
         )
 
     def limits(self, limits: Limits) -> bytes:

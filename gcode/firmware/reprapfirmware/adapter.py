@@ -56,7 +56,7 @@ class RepRapAdapter:
             return None
         return (
             f"the bed mesh rises by up to {slope:g} mm per mm (mesh_slope), and Z can follow a "
-            f"stream up to {STEEPEST_MESH:g}: tram the bed, or use --method advise, which leaves "
+            f"stream up to {STEEPEST_MESH:g}: tram the bed, or use method advise, which leaves "
             "all moves as they are and sets shaper and accelerations"
         )
 

@@ -4,9 +4,9 @@ const PLACES = { all: "Everywhere", visible: "Outer walls, top and bottom", wall
 
 /** @type {[RegExp, (found: string, value: string) => string][]} */
 const OPTIONS = [
-  [/--method advise/g, () => "the method “Advise”"],
-  [/say --dialect (\w+)/g, (_, value) => `choose ${value} under “File is written for”`],
-  [/\(--plate N, or plate=N over HTTP\)/g, () => "(“Plate of a 3MF package”)"],
+  [/\bmethod advise/g, () => "the method “Advise”"],
+  [/\(dialect \w+\)/g, () => "(“File is written for”)"],
+  [/\(option plate\)/g, () => "(“Plate of a 3MF package”)"],
   [/\bmax_mb=([\d.e+]+)/g, (_, value) => `“Largest file” ${value} MB`],
   [/\btolerance_um=([\d.]+)/g, (_, value) => `“Tolerance” ${value} µm`],
   [/\bwhere=(all|visible|walls)/g, (_, value) => `“Compensate: ${PLACES[/** @type {"all"} */ (value)]}”`],

@@ -36,6 +36,16 @@ def test_the_same_file_is_answered_with_the_job_that_is_there(client: TestClient
     assert post(client, b"G1 X12", "&name=a.gcode").status_code == 202
 
 
+def test_parameters_in_the_form_are_not_ignored(client: TestClient, data_dir: Path):
+    before = folders(data_dir)
+    form = {"file": ("a.gcode", b"G1 X13"), "method": (None, "none"), "note": (None, "mine")}
+    refused = client.post("/v1/jobs?machine=ender3", files=form)
+    assert_problem(refused, 422, "method:", "?method=...")
+    assert folders(data_dir) == before
+    del form["method"]
+    assert client.post("/v1/jobs?machine=ender3", files=form).status_code == 202
+
+
 def test_what_failed_is_tried_again(client: TestClient):
     first = post(client, b"bad")
     assert until(client, first.headers["location"], over)["state"] == "failed"
@@ -55,6 +65,18 @@ def test_a_repeated_request_makes_one_job(client: TestClient, data_dir: Path):
     assert_problem(post(client, b"G1 X21", **{"Idempotency-Key": "a b"}), 422, "idempotency-key")
     client.delete(first.headers["location"])
     assert post(client, b"G1 X21", "&fresh=true", **other).status_code == 202
+
+
+def test_a_misspelt_filter_does_not_select_everything(client: TestClient):
+    job = post(client, b"G1 X31").json()["id"]
+    refused = client.get("/v1/jobs?batc=mine&limit=5")
+    assert_problem(refused, 422, "batc: is not known here (given: 'mine')")
+    assert [error["name"] for error in refused.json()["errors"]] == ["batc"]
+    assert client.head(f"/v1/jobs/{job}/result?x=1").status_code == 422
+    assert_problem(client.delete(f"/v1/jobs/{job}?dry_run=true"), 422, "dry_run")
+    measured = "/v1/machines/mine/measurements?base=ender3&trail=true"
+    assert_problem(client.post(measured, files={"file": ("a.csv", b"1")}), 422, "trail")
+    assert client.get("/metrics?collector=1").status_code == 200
 
 
 def test_pages_batches_and_states(client: TestClient):

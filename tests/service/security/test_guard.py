@@ -146,6 +146,15 @@ def test_long_urls_and_headers_are_refused():
     assert client.get("/x?" + "a" * 8000, headers={"X-Long": "a" * 20_000}).status_code == 200
 
 
+def test_an_encoded_body_is_refused():
+    client = open_client()
+    refused = client.post("/x", content=b"\x1f\x8b", headers={"Content-Encoding": "gzip"})
+    assert refused.status_code == 415
+    assert "'gzip'" in refused.json()["detail"]
+    assert "send it as it is" in refused.json()["detail"]
+    assert client.post("/x", headers={"Content-Encoding": "Identity"}).status_code == 200
+
+
 def test_documents_are_limited_and_streams_are_not():
     client = open_client()
     large = b'{"a": "' + b"x" * (5 << 20) + b'"}'
