@@ -1,4 +1,4 @@
-"""Loops of small least-squares problems: Gram matrices, and their triangular factors."""
+"""Kernels of small least-squares problems: Gram matrices and their triangular factors."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def weighted_gram(running: Array, rows: Array, weight: Array, out: Array) -> Non
         Gram matrices of the rows before every `BLOCK`th sample, and of all.
     rows : ndarray, shape (components, window, n)
     weight : ndarray, shape (window,)
-        Of the squares, the same for a long time.
+        Of the squares; piecewise constant.
     out : ndarray, shape (n, n)
     """
     components, window, n = rows.shape
@@ -51,18 +51,18 @@ def weighted_gram(running: Array, rows: Array, weight: Array, out: Array) -> Non
 
 @kernel
 def factorise(square: Array) -> None:
-    """Replace the upper triangle of a definite matrix by U of its product U' U, in place.
+    """Replace the upper triangle of a positive definite matrix by its Cholesky factor U (U' U).
 
-    Small as these matrices are, LAPACK takes twice as long. What is below the triangle stays.
+    For such small matrices LAPACK takes twice as long. The lower triangle is left unchanged.
 
     Raises
     ------
     numpy.linalg.LinAlgError
-        When it is not definite.
+        If the matrix is not positive definite.
     """
     for k in range(len(square)):
         row = square[k, k:]
-        # Four rows above at a time: what is read and written in between is the row itself.
+        # Four rows above at a time, so that the row itself is read and written less often.
         i = 0
         while i + 4 <= k:
             a, b, c, d = square[i, k:], square[i + 1, k:], square[i + 2, k:], square[i + 3, k:]

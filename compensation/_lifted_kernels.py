@@ -1,4 +1,4 @@
-"""Loops of lifted systems that are not Toeplitz; `compensation.operators` wraps them."""
+"""Kernels of lifted systems that are not Toeplitz, wrapped by `compensation.operators`."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ def run_forward(
 ) -> None:
     """Fill y(k) = c x(k) + d u(k), x(k+1) = a x(k) + b u(k) with the plant `which[k]`, in place.
 
-    Every column of `u` is an input of its own; `x`, shape (order, columns), is its state, at
-    first the initial and afterwards the final one.
+    Every column of `u` is a separate input. `x`, shape (order, columns), holds their initial states
+    and receives the final ones.
     """
     samples, columns = u.shape
     order = b.shape[1]

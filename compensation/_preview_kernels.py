@@ -1,4 +1,4 @@
-"""Loops of the limited-preview recursion; `compensation.preview` wraps them."""
+"""Kernels of the limited-preview recursion, wrapped by `compensation.preview`."""
 
 from __future__ import annotations
 
@@ -52,9 +52,9 @@ def advance_window(
     z: NDArray[np.float64],
     committed: NDArray[np.float64],
 ) -> None:
-    """Bring z, the plants' states and the last two commands, after a committed command, in place.
+    """Advance z (the plants' states and the last two commands) by a committed command, in place.
 
-    `advance` takes the plants there without a command; `drive` is what z becomes by the command.
+    `advance` propagates the states without a command; `drive` adds the effect of the command.
     """
     following = np.dot(drive, committed)
     following[:-2] += np.dot(advance, z[:-2])
@@ -68,7 +68,7 @@ def advance_state(
     state: NDArray[np.float64],
     command: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """State of x <- a x + b u after the samples of `command`."""
+    """Return the state of x <- a x + b u after the samples of `command`."""
     order = len(b)
     x = state.copy()
     following = np.empty(order)
@@ -77,7 +77,7 @@ def advance_state(
             total = b[i] * command[k]
             for j in range(order):
                 total += a[i, j] * x[j]
-            # What has died away must not become denormal: such numbers are a hundred times slower.
+            # Flush decayed states to zero: denormal numbers are a hundred times slower.
             following[i] = total if abs(total) > _NOTHING else 0.0
         x[:] = following
     return x

@@ -1,4 +1,4 @@
-"""Loop of the input shapers; `compensation.shapers` wraps it."""
+"""Kernel of the input shapers, wrapped by `compensation.shapers`."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ def add_delayed(
     gains: NDArray[np.float64],
     out: NDArray[np.float64],
 ) -> None:
-    """Add a command, times each gain and shifted by so many samples, to `out`, all of shape (n,).
+    """Add copies of a command, delayed by `samples` and scaled by `gains`, to `out`, shape (n,).
 
-    Before its first and after its last sample the command stands; shifts below 0 are earlier.
+    The command holds its end values beyond its ends; negative delays are advances.
     """
     n = len(command)
-    # Block by block, so that what was written is still in the cache for the next pulse.
+    # Block by block, so that the output is still in the cache for the next pulse.
     for first in range(0, n, _BLOCK):
         stop = min(first + _BLOCK, n)
         for late, gain in zip(samples, gains):  # noqa: B905 - numba knows no strict
@@ -32,7 +32,7 @@ def add_delayed(
             ended = max(begun, min(max(n + late, first), stop))
             out[first:begun] += gain * command[0]
             out[ended:stop] += gain * command[n - 1]
-            # Slices and an index from 0: what numba vectorises.
+            # Slices indexed from 0, which numba vectorises.
             moved, taken = out[begun:ended], command[begun - late : ended - late]
             for k in range(len(moved)):
                 moved[k] += gain * taken[k]

@@ -1,4 +1,4 @@
-"""Loops of the sliding targets; `compensation.sliding` uses them, docs/method.md explains them."""
+"""Kernels of the sliding targets (`compensation.sliding`), explained in docs/method.md."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 
 @kernel
 def nearest_point(path: Array, x: float, y: float, k: int, reach: int) -> tuple[float, float]:
-    """Nearest point of the path (2, n) within `reach` samples of sample k."""
+    """Return the nearest point of the path (2, n) within `reach` samples of sample k."""
     n = path.shape[1]
     bx, by = path[0, k], path[1, k]
     nearest = (x - bx) ** 2 + (y - by) ** 2
@@ -44,21 +44,21 @@ def move_targets(
     relaxation: float,
     targets: Array,
 ) -> None:
-    """Move the targets of one member towards its own answer, along the path only, in place.
+    """Move the targets of one member towards its response, along the path only, in place.
 
     Parameters
     ----------
     path, answer : ndarray, shape (2, n)
-        Planned positions, and what the member does with the present command.
+        Planned positions, and the member's response to the present command.
     extruding : ndarray of bool, shape (n,)
     tau : float
         Weight of the error along the path against that across it, 0 to 1.
     travel : float
         Weight of the whole error where nothing is extruded.
     reach : int
-        The nearest point is looked for so many samples before and after.
+        Samples before and after in which the nearest point is searched.
     relaxation : float
-        1: to the new targets; up to 1.9: beyond them.
+        1: exactly to the new targets; up to 1.9: beyond them (over-relaxation).
     targets : ndarray, shape (2, n)
     """
     for k in range(path.shape[1]):
@@ -77,7 +77,7 @@ def move_targets(
 def contour_square(
     path: Array, answer: Array, extruding: NDArray[np.bool_], reach: int, stride: int
 ) -> float:
-    """Mean squared distance of an answer from the path while extruding, every `stride` samples."""
+    """Return the mean squared distance from the path while extruding, every `stride` samples."""
     total, count = 0.0, 0
     for k in range(0, path.shape[1], stride):
         if extruding[k]:

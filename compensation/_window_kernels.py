@@ -1,4 +1,4 @@
-"""Loops of a window with rests; `compensation.window_problem` wraps them."""
+"""Kernels of a window with rests, wrapped by `compensation.window_problem`."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ Flags = NDArray[np.bool_]
 
 
 class Functions(NamedTuple):
-    """Functions of a design, and what the plants make of them.
+    """Basis functions of a design, and the plants' responses to them.
 
     Attributes
     ----------
@@ -45,13 +45,13 @@ class Functions(NamedTuple):
         Running Gram matrices (`weighted_gram`) of `basis` and `filtered`.
     filtered : ndarray, shape (components, window, n)
     free : ndarray, shape (components, window, nz)
-        What states do by themselves.
+        Free responses of the states.
     reach : ndarray, shape (nz - 2, window)
-        From commands to states at the window's end.
+        Maps commands to states at the end of the window.
     stop : ndarray, shape (components, window)
-        Response to a step of the command's speed.
+        Response to a step in the command's speed.
     price : float
-        Of squared increments.
+        Weight of squared increments.
     """
 
     basis: Array
@@ -66,14 +66,14 @@ class Functions(NamedTuple):
 
 
 class Stepping(NamedTuple):
-    """How a design's windows without rests go on, and how the plants do.
+    """Recursion of a design's windows without rests, and of its plants.
 
     Attributes
     ----------
     command_gain, state_gain : ndarray, shapes (update, nz) and (nz, nz)
         E and F of `run_windows`.
     advance, drive : ndarray, shapes (nz - 2, nz - 2) and (nz, update)
-        As `advance_window` has them.
+        As in `advance_window`.
     command, state : ndarray, shapes (windows, update) and (windows, nz)
         S y_d and H y_d of every window.
     """
@@ -87,7 +87,7 @@ class Stepping(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """Windows solved by themselves: z before, and the samples that were committed.
+    """Cache of windows solved individually: z before, and the samples committed.
 
     Attributes
     ----------
@@ -101,19 +101,19 @@ class Memory(NamedTuple):
 
 
 class Tied(NamedTuple):
-    """A window solved by itself without bounds.
+    """A window solved individually without bounds.
 
     Attributes
     ----------
     command : ndarray, shape (window,)
     kept : bool
-        Whether it keeps its limits all the same.
+        Whether the command keeps its limits.
     moving, fixed : ndarray, shapes (k, 2) and (window,)
         Segments between the rests, and the command without functions.
     factor, wish, ends
         As in `_tied_problem`.
     pinned, values : ndarray, shapes (pins, n) and (pins,)
-        Where the command stands on the path: pinned w = values.
+        Constraints that put the command on the path: pinned w = values.
     """
 
     command: Array
@@ -145,35 +145,36 @@ def solve_windows(
     last: int,
     u: Array,
 ) -> tuple[int, Tied]:
-    """Step windows first..last - 1 until one does not keep its limits by itself.
+    """Step windows first..last - 1 until one exceeds its limits.
 
     Parameters
     ----------
     stepping, functions, rest_functions
-        `functions` solve `careful` windows, `rest_functions` those that meet a stop; all others
-        take their steps.
+        `careful` windows are solved with `functions`, those that meet a stop with
+        `rest_functions`; all others are stepped.
     squeeze : ndarray, shape (k, nz - 2)
-        From the plants' states to those of `rest_functions`, which may have fewer components too.
+        Maps the plants' states to those of `rest_functions`, which may also have fewer components.
     path, weight : ndarray, shape (windows update + window,)
-        As `tied_window` has them, of the whole piece.
+        As in `tied_window`, for the whole piece.
     targets : ndarray, shape (components, windows update + window)
     stops : ndarray of int64, shape (k, 2)
-        Ranges [a, b) of samples, rising and apart.
+        Ranges [a, b) of samples, rising and disjoint.
     careful : ndarray of bool, shape (windows,)
     limits
         As in `tied_window`.
     memory : Memory
-        Windows that begin as they did before are not solved again.
+        Windows with the same initial state as before are not solved again.
     z : ndarray, shape (nz,)
-        The plants' states and the last two commands, carried on.
+        The plants' states and the last two commands, updated in place.
     u : ndarray, shape (windows update,)
         The command.
 
     Returns
     -------
     window : int
-        Which one does not keep its limits, with its solution; or `last`, and nothing.
+        Index of the window that exceeds its limits; `last` if none does.
     tied : Tied
+        Its solution.
     """
     window, update = len(functions.basis), stepping.command.shape[1]
     met = coming = 0
@@ -215,7 +216,7 @@ def solve_windows(
 
 @kernel
 def _same(a: Array, b: Array) -> bool:
-    """Tell whether two rows of numbers are equal."""
+    """Return whether two rows of numbers are equal."""
     differing = 0
     for k in range(len(a)):
         differing += a[k] != b[k]
@@ -248,12 +249,12 @@ def tied_window(
     rests: Ints,
     limits: Array,
 ) -> Tied:
-    """Command of a window that stands on the path in its rests, and whether it keeps its limits.
+    """Return the command of a window that stands on the path in its rests; check its limits.
 
     Parameters
     ----------
     path : ndarray, shape (window,)
-        On which the command stands in the rests.
+        Path on which the command stands in the rests.
     rests : ndarray of int64, shape (k - 1, 2)
         Ranges [a, b) of samples, relative to the window; they may reach beyond it.
     limits : ndarray, shape (4,)
@@ -264,7 +265,7 @@ def tied_window(
     Raises
     ------
     numpy.linalg.LinAlgError
-        When the problem is singular, or the rests contradict each other.
+        If the problem is singular, or the rests contradict each other.
     """
     basis = functions.basis
     last, previous = z[-2], z[-1]
@@ -296,7 +297,7 @@ def tied_window(
 
 @kernel
 def _between(rests: Ints, window: int) -> Ints:
-    """Segments [s, e) of a window between its rests, some of them without samples."""
+    """Return the segments [s, e) of a window between its rests; some may be empty."""
     moving = np.zeros((len(rests) + 1, 2), np.int64)
     for m in range(len(rests)):
         moving[m, 1] = max(rests[m, 0], 0)
@@ -309,12 +310,12 @@ def _between(rests: Ints, window: int) -> Ints:
 def _tied_problem(
     functions: Functions, z: Array, targets: Array, weight: Array, moving: Ints
 ) -> tuple[Array, Array, Array]:
-    """Weighted least squares of a window with rests, factored: least |w - wish|^2.
+    """Set up the weighted least squares of a window with rests in factored form: min |w - wish|^2.
 
-    Up to the first stop the functions are the free ones. Later their response is the free one minus
-    what the free functions' states at the segment's start would go on to do, plus what the segments
-    before left behind. In a rest there is only what was left behind, a few states for many samples:
-    these samples are summed up first, and meet the functions by way of the states.
+    Up to the first stop the functions are the free ones. In later segments their response is the
+    free one, minus the continuation of the free functions' states at the segment's start, plus the
+    decay of the states left by earlier segments. A rest contains only the latter, a few states for
+    many samples: these samples are summed first, and mapped to the functions through the states.
 
     Parameters
     ----------
@@ -322,7 +323,7 @@ def _tied_problem(
     z, targets, weight
         As in `compensation.window_problem.solve_window`.
     moving : ndarray of int64, shape (k, 2)
-        Segments [s, e) between rests, some of them without samples.
+        Segments [s, e) between rests; some may be empty.
 
     Returns
     -------
@@ -330,7 +331,7 @@ def _tied_problem(
         The triangle L', upper, with w = L' c (`factorise`).
     wish : ndarray, shape (n,)
     ends : ndarray, shape (k - 1, n)
-        Where the functions' commands stand in each rest.
+        Values of the functions' commands in each rest.
     """
     basis, summed, efforts, filtered, grams, free, reach, stop, price = functions
     window, n = basis.shape
@@ -338,7 +339,7 @@ def _tied_problem(
     first, speed = moving[0, 1], z[-2] - z[-1]
     normal, right = price * efforts[-1], np.zeros(n)
     if rests > 0:
-        # The untied increments are priced too, or few samples would leave the matrix indefinite.
+        # Untied increments are weighted too: few samples could leave the matrix singular.
         prices = np.zeros(window)
         for s, e in moving:
             prices[s:e] = price
@@ -378,7 +379,7 @@ def _tied_problem(
     later = 0
     for s, e in moving[1:]:
         later += e - s
-    # Rows of which the squares are added up.
+    # Rows whose squares are summed.
     rows, row = np.empty((len(filtered) * later, n)), 0
     for c in range(len(filtered)):
         error = weight * (targets[c] - np.dot(free[c], z))
@@ -410,7 +411,7 @@ def _tied_problem(
 
 @kernel
 def _fill_shares(free: Array, weight: Array, moving: Ints, shares: Array) -> None:
-    """Weighted responses of one component to each source, from the first stop on.
+    """Fill the weighted responses of one component to each source, from the first stop on.
 
     Parameters
     ----------
@@ -438,7 +439,7 @@ def _fill_shares(free: Array, weight: Array, moving: Ints, shares: Array) -> Non
 
 @kernel
 def _states(summed: Array, reach: Array, s: int, e: int) -> Array:
-    """States at e, shape (nz, n), that increments in [s, e) leave behind."""
+    """Return the states at e, shape (nz, n), caused by increments in [s, e)."""
     order, samples = len(reach), e - s
     gain = np.zeros((order + 2, samples))
     gain[:order] = reach[:, len(summed) - samples :]
@@ -446,7 +447,7 @@ def _states(summed: Array, reach: Array, s: int, e: int) -> Array:
         gain[order + i, samples - 1 - i] = 1.0
     states: Array = np.dot(gain, summed[s:e])
     if s > 0:
-        # Off the straight line on which the functions go on from before.
+        # Relative to the straight line that continues the functions from before s.
         for i in range(order + 2):
             at, by = 0.0, 0.0
             for k in range(samples):
@@ -462,7 +463,7 @@ def _states(summed: Array, reach: Array, s: int, e: int) -> Array:
 def command_of(
     factor: Array, w: Array, basis: Array, moving: Ints, last: float, previous: float, path: Array
 ) -> Array:
-    """Command of the coefficients c with factor c = w, in its rests on the path to the last bit."""
+    """Return the command of c with factor c = w, bit-exactly on the path in its rests."""
     c = w.copy()
     backward(factor, c)
     command = tied_command(np.dot(basis, c), moving, last, previous)
@@ -474,7 +475,7 @@ def command_of(
 
 @kernel
 def tied_command(increments: Array, moving: Ints, last: float, previous: float) -> Array:
-    """Command of increments, (window,), that stops with the first sample of every rest."""
+    """Return the command of increments, (window,), that stops at the start of every rest."""
     window = len(increments)
     out = np.empty(window)
     u, step = last, last - previous
@@ -494,13 +495,13 @@ def tied_command(increments: Array, moving: Ints, last: float, previous: float) 
 def extremes(
     command: Array, last: float, previous: float, stops: bool
 ) -> tuple[float, float, float, float, float]:
-    """Look at a command that follows the samples `previous` and `last`.
+    """Measure a command that follows the samples `previous` and `last`.
 
     Returns
     -------
     accel, speed, low, high, mean_square : float
         Largest second and first difference, lowest and highest value, and the mean of the squared
-        second differences; with `stops` that after the last sample is looked at too.
+        second differences; with `stops` the one after the last sample is included.
     """
     accel = speed = total = 0.0
     low = high = command[0]
@@ -533,7 +534,7 @@ def constraints_at(
     ends: Array,
     taken: Flags,
 ) -> tuple[Array, Array, Array]:
-    """Bound a command's increments, steps and positions where they leave their bounds.
+    """Return constraints where a command's increments, steps and positions exceed their bounds.
 
     Parameters
     ----------
@@ -542,17 +543,17 @@ def constraints_at(
     last, previous : float
         The commands before the window.
     bounds : ndarray, shape (3, 4)
-        For increments, steps and positions: lowest and highest value, by how much a constraint is
-        tighter, and what rows are scaled by.
+        For increments, steps and positions: lowest and highest value, margin of a constraint, and
+        scale of its row.
     factor, summed, moving, ends
         As in `tied_window`.
     taken : ndarray of bool, shape (3, window)
-        Samples that have a constraint; those found are added.
+        Samples that already have a constraint; new ones are added.
 
     Returns
     -------
     rows : ndarray, shape (m, n)
-        For w.
+        Constraints on w: low <= rows w <= high.
     low, high : ndarray, shape (m,)
     """
     window, n = summed.shape
@@ -561,7 +562,7 @@ def constraints_at(
     count = 0
     for m in range(len(moving)):
         s, e = moving[m]
-        # The first sample of a rest has the increment that stops the command.
+        # The increment that stops the command is at the first sample of a rest.
         for k in range(s, min(e + 1, window)):
             for kind in range(3 if k < e else 1):
                 value, constant = 0.0, 0.0
@@ -589,7 +590,7 @@ def constraints_at(
 def _add_position(
     share: float, k: int, summed: Array, moving: Ints, ends: Array, row: Array
 ) -> None:
-    """Add a share of the tied functions' commands at sample k."""
+    """Add the tied functions' commands at sample k times `share` to a row."""
     if k < 0:
         return
     m = len(moving) - 1
@@ -601,7 +602,7 @@ def _add_position(
     last = min(k, e - 1)
     if last >= s:
         row += share * summed[last]
-        # Without what the functions did before, and the line on which they would go on.
+        # Subtract the functions' earlier part and the straight line that continues it.
         steps = float(last - s + 1)
         if s > 0:
             row -= share * (steps + 1.0) * summed[s - 1]
@@ -610,4 +611,4 @@ def _add_position(
 
 
 _SHARES = np.array([[1.0, -2.0, 1.0], [1.0, -1.0, 0.0], [1.0, 0.0, 0.0]])
-"""How increments, steps and positions are made of a command's last samples."""
+"""Increments, steps and positions as combinations of a command's last samples."""

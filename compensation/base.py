@@ -1,4 +1,4 @@
-"""Interface of all compensators."""
+"""The interface of all compensators."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ class DesignError(ValueError):
 
 
 class Compensator(Protocol):
-    """From planned positions to commands, X and Y together, one piece at a time.
+    """Turns planned positions into commands, X and Y together, one piece at a time.
 
     Attributes
     ----------
     name : str
     lead_s, tail_s : float
-        Standing time that it needs before and after every stretch of motion; 0 where the command
-        stands on the plan in every rest.
+        Standstill that it needs before and after every stretch of motion; 0 if the command stands
+        on the plan in every rest.
     """
 
     name: str
@@ -36,11 +36,11 @@ class Compensator(Protocol):
         ...
 
     def observe(self, command_mm: NDArray[np.float64]) -> None:
-        """Let the machine follow a command, shape (2, n), that was not ours."""
+        """Account for a command, shape (2, n), that did not come from `compensate`."""
         ...
 
     def commit(self) -> None:
-        """Take the last command as executed."""
+        """Mark the last command as executed."""
         ...
 
     def operate_at(self, point: OperatingPoint) -> None:
@@ -48,9 +48,9 @@ class Compensator(Protocol):
         ...
 
     def ease(self, accel_share: float) -> bool:
-        """Ask for at most this share of the machine's acceleration; return whether it can.
+        """Use at most this share of the machine's acceleration; return whether that is possible.
 
-        0: for no more than the path itself asks for.
+        0: no more than the path itself needs.
         """
         ...
 
@@ -96,5 +96,5 @@ class Memoryless:
         """Do nothing."""
 
     def ease(self, accel_share: float) -> bool:
-        """Return false unless it is 1: the path decides."""
+        """Return whether the share is 1: a memoryless command cannot be eased."""
         return accel_share == 1.0

@@ -39,10 +39,10 @@ Array = NDArray[np.float64]
 Basis = Callable[[LiftedSet, int], Array]
 
 TOLERANCE = 1e-7
-"""Directions that the plants answer by less than this share of their best are left out of robust
-bases. A Gram matrix holds squares: it knows singular values to 1e-8 of the largest."""
+"""Directions with less than this share of the largest gain are left out of robust bases. A Gram
+matrix contains squares: it resolves singular values to 1e-8 of the largest."""
 ZERO = 1e-13
-"""Singular values of a matrix below this share of the largest are zero but for rounding."""
+"""Singular values below this share of the largest are zero apart from rounding."""
 
 
 def bspline_functions(samples: int, n: int, degree: int = 3) -> Array:
@@ -58,7 +58,7 @@ def bspline_functions(samples: int, n: int, degree: int = 3) -> Array:
     _check(n, samples)
     if n <= degree:
         raise DesignError(f"n = {n} B-splines of degree {degree}: take at least {degree + 1}")
-    from scipy.interpolate import BSpline  # half a second to import, seldom needed
+    from scipy.interpolate import BSpline  # takes half a second to import, rarely needed
 
     inner = np.linspace(0.0, samples - 1.0, n - degree + 1)
     knots = np.concatenate([np.full(degree, inner[0]), inner, np.full(degree, inner[-1])])
@@ -115,14 +115,14 @@ def ce_opt_basis(gram: Array, n: int) -> Array:
 def ce_opt_basis_of(plant: LiftedOperator, n: int) -> Array:
     """`ce_opt_basis` of one plant by Lanczos steps, for paths too long for a Gram matrix.
 
-    Only products with G and G' are made: 600 functions of 10 000 samples take seconds and a tenth
+    Only products with G and G' are needed: 600 functions of 10 000 samples take seconds and a tenth
     of the memory. At most m - 1 functions; for more than some m / 5 the Gram matrix is faster.
     """
     m = plant.shape[1]
     _check(n, m - 1)
     from scipy.sparse.linalg import svds  # slow to import, seldom needed
 
-    # A start of our own makes the result repeatable.
+    # A fixed start vector makes the result repeatable.
     start = np.cos(np.arange(m) ** 1.5)
     _, sigma, vt = svds(plant.as_linear_operator(), k=n, v0=start)
     return _signed(np.asarray(vt[np.argsort(-sigma)].T, np.float64))
@@ -142,8 +142,8 @@ def robust_basis(gram: Array, mean: Array, n: int, r: int | None = None) -> Arra
     n : int
         Number of functions, at most m - r.
     r : int, optional
-        How many of the directions that the set answers least to leave out, as in (4.10). By
-        default those whose singular value is below `TOLERANCE` times the largest.
+        Number of directions with the least gain to leave out, as in (4.10). By default those whose
+        singular value is below `TOLERANCE` times the largest.
 
     Returns
     -------
@@ -153,7 +153,7 @@ def robust_basis(gram: Array, mean: Array, n: int, r: int | None = None) -> Arra
     Raises
     ------
     DesignError
-        If n functions do not fit into what the set answers.
+        If the set responds to fewer than n directions.
     """
     _check(n, len(gram))
     functions, mu = robust_functions(gram, mean, r)
@@ -166,12 +166,12 @@ def robust_basis(gram: Array, mean: Array, n: int, r: int | None = None) -> Arra
 
 
 def robust_functions(gram: Array, mean: Array, r: int | None = None) -> tuple[Array, Array]:
-    """Order what a plant set answers by how much all of it agrees there.
+    """Order the input directions of a plant set by how well its members agree on them.
 
     Parameters
     ----------
     gram, mean, r
-        As `robust_basis` takes them.
+        As in `robust_basis`.
 
     Returns
     -------
@@ -203,7 +203,7 @@ def robust_basis_for(nominal: Array, spread_gram: Array, n: int, r: int = 0) -> 
     Parameters
     ----------
     nominal, spread_gram, r
-        As `spread_functions` takes them.
+        As in `spread_functions`.
     n : int
         Number of functions, at most m - r.
 
@@ -223,7 +223,7 @@ def robust_basis_for(nominal: Array, spread_gram: Array, n: int, r: int = 0) -> 
 
 
 def spread_functions(nominal: Array, spread_gram: Array, r: int = 0) -> tuple[Array, Array]:
-    """Order what a nominal model answers by how much the plants differ from it there.
+    """Order the input directions of a nominal model by how much the plants differ from it.
 
     Parameters
     ----------
@@ -232,7 +232,7 @@ def spread_functions(nominal: Array, spread_gram: Array, r: int = 0) -> tuple[Ar
     spread_gram : ndarray, shape (m, m)
         Delta'Delta of (4.14), from `compensation.nominal.spread_gram`.
     r : int
-        How many of the smallest singular values of G_nom to leave out (4.10).
+        Number of the smallest singular values of G_nom to leave out (4.10).
 
     Returns
     -------
@@ -244,7 +244,7 @@ def spread_functions(nominal: Array, spread_gram: Array, r: int = 0) -> tuple[Ar
     Raises
     ------
     DesignError
-        If r is not in 0 .. m - 1, or the singular values that are left in include a zero.
+        If r is not in 0 .. m - 1, or a remaining singular value is zero.
     """
     m = nominal.shape[1]
     if not 0 <= r < m:
@@ -267,7 +267,7 @@ def orthonormal(functions: Array) -> Array:
 
 
 def _signed(functions: Array) -> Array:
-    # Eigenvectors are free in sign; fix it so that the same model gives the same bytes.
+    # The sign of eigenvectors is arbitrary; fix it so that the same model gives the same bytes.
     top = functions[np.argmax(np.abs(functions), axis=0), np.arange(functions.shape[1])]
     return np.ascontiguousarray(functions * np.sign(top))
 

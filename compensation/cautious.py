@@ -1,9 +1,9 @@
 """Filtered basis functions blended with a shaper, for plants that are only partly known.
 
-Where the members of a set disagree, inverting the plant that lies in the middle makes the others
-worse; a shaper, which is symmetric and only smooths, does little good and little harm to any. Plant
-and command are linear, so the error of a mixture of both commands is the mixture of their errors,
-member by member, and the best mixture can be computed (`pipeline.caution`).
+Where the members of a set disagree, inverting the plant in the middle makes the others worse; a
+shaper, which only smooths symmetrically, does little good and little harm to any. Plant and command
+are linear, so for every member the error of a mixture of both commands is the mixture of their
+errors, and the best mixture can be computed (`pipeline.caution`).
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Caution:
-    """How much of the command of X and Y is that of filtered basis functions, and the shaper.
+    """Share of filtered basis functions in the command of X and Y, and the shaper for the rest.
 
     Attributes
     ----------
     shares : (float, float)
-        Of X and Y, 0 (the shaper alone) to 1.
+        For X and Y, 0 (the shaper alone) to 1.
     shaper : str
     fx_hz, fy_hz : float
     fit_share : float
-        How much of the tolerance a fit to the command may use.
+        Share of the tolerance that a fit to the command may use.
     """
 
     shares: tuple[float, float]
@@ -49,8 +49,8 @@ class Caution:
 class CautiousFbf:
     """share * filtered basis functions + (1 - share) * shaper, axis by axis.
 
-    A shaper asks for no more than the path: where the motors bear no command of filtered basis
-    functions, or only one that follows the path worse, the shaper's is taken.
+    A shaper needs no more than the path: where the motors cannot follow any command of filtered
+    basis functions, or only one that is less accurate, the shaper's is used.
 
     Parameters
     ----------
@@ -90,21 +90,18 @@ class CautiousFbf:
         self._inner.reset(position_mm)
 
     def observe(self, command_mm: Array) -> None:
-        """Let the machine follow a command (2, n) that was not ours."""
+        """Account for a command (2, n) that did not come from `compensate`."""
         self._inner.observe(command_mm)
 
     def commit(self) -> None:
-        """Take the last command as executed."""
+        """Mark the last command as executed."""
         self._inner.commit_as(self._last)
 
     def operate_at(self, point: OperatingPoint) -> None:
-        """Do nothing: the plants of this machine stay."""
+        """Do nothing: the plants of this machine are constant."""
 
     def ease(self, accel_share: float) -> bool:
-        """Ask for at most this share of the machine's acceleration from now on.
-
-        0: the shaper alone.
-        """
+        """Use at most this share of the machine's acceleration from now on; 0: the shaper alone."""
         self._shaper_alone = accel_share == 0.0
         return self._shaper_alone or self._inner.ease(accel_share)
 
@@ -116,11 +113,11 @@ class CautiousFbf:
         if not self._shaper_alone and self._shares.any():
             exact = self._inner.compensate(y_d_mm, extruding, rests)
             mixed = self._shares * exact + (1.0 - self._shares) * smooth
-            # Bent into the machine's limits further than where the shares were chosen?
-            gentle = max(self._inner.rungs) > GENTLE_RUNG
-            if not gentle or self._better(mixed, smooth, y_d_mm, extruding):
+            # A gentler design than the one for which the shares were chosen may be worse.
+            gentler = max(self._inner.rungs) > GENTLE_RUNG
+            if not gentler or self._better(mixed, smooth, y_d_mm, extruding):
                 self._last = mixed
-        # Both end on the plan; sums of products may not, to the last bit.
+        # Both end on the plan, but their weighted sum may miss it by rounding.
         self._last[:, -1] = y_d_mm[:, -1]
         return self._last
 

@@ -1,7 +1,6 @@
 """The method and basis of a job that names none.
 
-They stand in a module of their own because the command line shows them before it imports anything
-that computes.
+They have their own module because the command line shows them before it imports numerical code.
 """
 
 from __future__ import annotations

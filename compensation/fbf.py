@@ -1,9 +1,9 @@
 """The product's main compensator: filtered basis functions in limited preview.
 
-Accuracy is set by the number of functions n, which is the command's bandwidth; the basis then
-keeps the effort small. A piece therefore takes, axis by axis, the first design of a ladder whose
-command stays as smooth as the machine needs it (two-step design, paper 003, remark 3.2). Windows in
-which it still leaves a bound of the machine are solved again within the bounds.
+Accuracy is set by the number of functions n, which is the command's bandwidth; the basis keeps the
+effort small. Each axis of a piece therefore uses the first design of a ladder whose command is
+smooth enough for the machine (two-step design, paper 003, remark 3.2). Windows in which the command
+still exceeds the machine's bounds are solved again within them.
 
 For a plant set the error along the path may count less than the error across it
 (`compensation.sliding`).
@@ -49,15 +49,15 @@ ROBUST = ("off", "ensemble", "minimax")
 weights that balance the members' errors."""
 
 ACCEL_RATIO = 1.4
-"""An axis may ask for at most this multiple of the planned path's own peak acceleration; X and Y
-together then stay below twice of it."""
+"""Largest ratio of the command's peak acceleration to the planned path's; X and Y together then
+stay below twice the path's."""
 RMS_RATIO = 1.5
-"""The same for the rms acceleration, as long as that costs no functions."""
+"""The same for the rms acceleration, unless that would cost functions."""
 _BOUNDED_SHARE = 0.2
-"""Windows outside the bounds are solved again if they are fewer; else a gentler design is taken."""
+"""If more windows exceed the bounds, a gentler design is used instead of solving them again."""
 _BOUNDED_ROUNDS = 4
 _REACH_S, _STRIDE = 0.03, 7
-"""The nearest point of the path is looked for within this time, at every 7th sample."""
+"""The nearest point of the path is searched within this time, at every 7th sample."""
 
 
 class PreviewFbf:
@@ -74,20 +74,19 @@ class PreviewFbf:
     robust : str
         One of `ROBUST`.
     along : float, optional
-        Weight of the error along the path against that across it, above 0; 1, the default: they
-        count alike, which is least squares to the path. With .09 a set is followed somewhat better
-        across the path (docs/benchmarks.md), at some ten times the time.
+        Weight of the error along the path relative to that across it, above 0. The default 1 is
+        plain least squares. With .09 the error of a set across the path is somewhat smaller
+        (docs/benchmarks.md), at about ten times the computing time.
     window_s, update_s : float
-        Preview window and how much of it is committed before the next one starts.
+        Preview window, and the part of it committed before the next one starts.
 
     Attributes
     ----------
     lifted : tuple of LiftedWindow
-        What X and Y are designed for: plants and their weights.
+        Plants and weights for which X and Y are designed.
     along : float
     rungs : tuple of int
-        Steps of the ladders (`LADDER`, within the models' bands) that the last command took, X and
-        Y.
+        Rungs of the ladders (`LADDER`, within the models' bands) used by the last command, X and Y.
 
     Raises
     ------
@@ -96,7 +95,7 @@ class PreviewFbf:
 
     Notes
     -----
-    The machine's vibration is carried from one piece to the next: call `commit` when the last
+    The machine's vibration carries over from one piece to the next: call `commit` if the last
     command was used, `observe` for motion that stays as sliced, `reset` when the position jumps.
     """
 
@@ -135,8 +134,7 @@ class PreviewFbf:
         self._travel = [machine.travel[axis] for axis in ("x", "y")]
         self._last: list[AxisCommand] = []
         self.rungs: tuple[int, ...] = ()
-        # What delays slow motion is no vibration: a command that led it would put it right only if
-        # that delay were true.
+        # Delays are not vibration: leading the path by them would help only if they were exact.
         sets = [plant_set(machine.axes[axis].without_delay(), dt_s) for axis in ("x", "y")]
         chosen = _chosen(sets, robust, dt_s, window, update, basis, along)
         bands_hz = [machine.axes["x"].band_hz, machine.axes["y"].band_hz]
@@ -155,30 +153,30 @@ class PreviewFbf:
             axis.reset(float(position))
 
     def observe(self, command_mm: Array) -> None:
-        """Let the machine follow a command (2, n) that was not ours."""
+        """Account for a command (2, n) that did not come from `compensate`."""
         for axis, command in zip(self._axes, command_mm, strict=True):
             axis.observe(command)
 
     def commit(self) -> None:
-        """Take the last command as executed."""
+        """Mark the last command as executed."""
         for axis, command in zip(self._axes, self._last, strict=True):
             axis.commit(command)
 
     def commit_as(self, command_mm: Array) -> None:
-        """Take a command (2, n) as executed that was made of the last one."""
+        """Mark a command (2, n) derived from the last one as executed."""
         for axis, command in zip(self._axes, command_mm, strict=True):
             axis.commit_as(command)
 
     def operate_at(self, point: OperatingPoint) -> None:
-        """Do nothing: the plants of this machine stay."""
+        """Do nothing: the plants of this machine are constant."""
 
     def ease(self, accel_share: float) -> bool:
-        """Ask for at most this share of the machine's acceleration from now on; 0 is too little."""
+        """Use at most this share of the machine's acceleration from now on; 0 is not possible."""
         self._accel_share = accel_share
         return accel_share > 0.0
 
     def compensate(self, y_d_mm: Array, extruding: NDArray[np.bool_], rests: Ints) -> Array:
-        """Command of a piece that starts and ends standing still on the path.
+        """Return the command of a piece that starts and ends at rest on the path.
 
         Parameters
         ----------
@@ -196,7 +194,7 @@ class PreviewFbf:
         Raises
         ------
         DesignError
-            When no rung of the ladder keeps the machine's limits.
+            If no rung of the ladder keeps the machine's limits.
         """
         n = y_d_mm.shape[1]
         weight = np.where(extruding, 1.0, WEIGHT_TRAVEL)
@@ -227,9 +225,9 @@ class PreviewFbf:
     def contour_square(
         self, y_d_mm: Array, command_mm: Array, extruding: NDArray[np.bool_]
     ) -> float:
-        """Return the mean squared error [mm2] across a path (2, n) of a piece's command.
+        """Return the mean squared contour error [mm2] of a piece's command from a path (2, n).
 
-        Over the plants designed for, those of X and Y side by side, and over extruding motion.
+        The mean is over the design's plants, paired between X and Y, and over extruding motion.
         """
         count = max(axis.members for axis in self._axes)
         reach = round(_REACH_S / self._dt_s)
@@ -241,7 +239,7 @@ class PreviewFbf:
         return total / count
 
     def accel_limits_mm_s2(self, y_d_mm: Array) -> tuple[float, float]:
-        """Acceleration that the command of X and of Y may ask for on a path (2, n)."""
+        """Return the largest acceleration allowed to the commands of X and Y on a path (2, n)."""
         return self._accel_limits_mm_s2([Extremes.of(p, p[0], p[0]) for p in y_d_mm])
 
     def _accel_limits_mm_s2(self, asked: list[Extremes]) -> tuple[float, float]:
@@ -261,7 +259,7 @@ class PreviewFbf:
         )
 
     def _ladder(self, axis: PreviewAxis, task: AxisTask) -> tuple[AxisCommand, int, frozenset[int]]:
-        """Command, rung and windows solved within bounds."""
+        """Return command, rung and the windows solved within bounds."""
         dt, bounds = self._dt_s, task.bounds
         rung, last = axis.rung, axis.last_rung
         careful: frozenset[int] = frozenset()
@@ -271,7 +269,7 @@ class PreviewFbf:
             try:
                 found = axis.command(rung, task, careful)
             except DesignError:
-                # This design refuses itself; a gentler one may not.
+                # This design fails its acceptance; a gentler one may not.
                 if rung == last:
                     raise
                 rung, careful, rounds = rung + 1, frozenset(), 0
@@ -286,17 +284,15 @@ class PreviewFbf:
                 )
             if rms <= task.rms_limit_mm_s2 or rung >= GENTLE_RUNG:
                 if bounds.kept(reached):
-                    # The next piece starts here, or higher where there was room to spare.
-                    roomy = rms < 0.8 * task.rms_limit_mm_s2 or rung > GENTLE_RUNG
+                    # The next piece starts here, or on a more accurate rung if there is room.
+                    has_room = rms < 0.8 * task.rms_limit_mm_s2 or rung > GENTLE_RUNG
                     if len(command) > axis.update:
-                        axis.next_rung = max(0, rung - 1) if roomy else rung
+                        axis.next_rung = max(0, rung - 1) if has_room else rung
                     return found, rung, careful
-                concerned = axis.windows_outside(bounds, command)
-                few = len(careful | concerned) <= max(
-                    2, _BOUNDED_SHARE * len(command) / axis.update
-                )
-                if rounds < _BOUNDED_ROUNDS and not concerned <= careful and (few or rung == last):
-                    careful |= concerned
+                outside = axis.windows_outside(bounds, command)
+                few = len(careful | outside) <= max(2, _BOUNDED_SHARE * len(command) / axis.update)
+                if rounds < _BOUNDED_ROUNDS and not outside <= careful and (few or rung == last):
+                    careful |= outside
                     rounds += 1
                     continue
             if rung == last:
@@ -311,7 +307,7 @@ class PreviewFbf:
 
 
 def _merged(stops: Ints) -> Ints:
-    """Return the stops in order, those that touch made one."""
+    """Return the stops in order, with touching ones merged."""
     spans: list[list[int]] = []
     for a, b in sorted(map(tuple, stops.tolist())):
         if spans and a <= spans[-1][1]:
@@ -324,7 +320,7 @@ def _merged(stops: Ints) -> Ints:
 def _chosen(
     sets: list[PlantSet], robust: str, *design: Any
 ) -> list[tuple[tuple[DiscretePlant, ...], tuple[float, ...]]]:
-    """Plants and weights of X and Y that a robust mode looks at."""
+    """Return the plants and weights of X and Y for a robust mode."""
     if robust == "off":
         return [((plants.nominal,), (1.0,)) for plants in sets]
     given = [(plants.members, tuple(plants.weights.tolist())) for plants in sets]

@@ -1,7 +1,7 @@
-"""Compensation of dry friction, laid over a compensator of vibration.
+"""Compensation of dry friction on top of a vibration compensator.
 
-The axes should receive w, and with the command w + c s(w) they do (`models.friction`). The
-reversals of s are rounded symmetrically, so that the motors can follow.
+With the command w + c s(w) the axes receive w (`models.friction`). The reversals of s are smoothed
+symmetrically, so that the motors can follow.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ __all__ = ["FrictionCompensator", "against_friction"]
 Array = NDArray[np.float64]
 
 _ROUNDED_S = (4e-3, 8e-3, 16e-3)
-"""Lengths of the window that rounds turns; the first is taken that keeps the machine's limits."""
+"""Lengths of the smoothing window; the first that keeps the machine's limits is used."""
 _BLEND_S = 0.01
 
 
@@ -38,11 +38,11 @@ def against_friction(
     Parameters
     ----------
     held_mm : (float, float)
-        How far friction holds X and Y back.
+        Distance by which friction holds X and Y back.
     rests : ndarray of int64, shape (k, 2)
         Sample ranges [a, b) in which nothing is added.
     rounded_s : float
-        Length of the window that rounds turns.
+        Length of the window that smooths reversals.
     """
     window = _window(rounded_s, dt_s)
     bends = np.stack([_rounded(bend_of(row), window) for row in wanted_mm])
@@ -52,15 +52,15 @@ def against_friction(
 
 
 class FrictionCompensator(Overlay):
-    """Make up for dry friction under another compensator.
+    """Compensate dry friction on top of another compensator.
 
-    In rests, and at the ends of a piece, the command stands on the plan; `_BLEND_S` before and
-    after, what friction needs fades in and out.
+    In rests, and at the ends of a piece, the command stands on the plan; the correction fades out
+    and in within `_BLEND_S` before and after.
 
     Parameters
     ----------
     inner : Compensator
-        What undoes the vibration: its command is what the axes shall receive.
+        Compensates vibration: its command is what the axes should receive.
     machine : Machine
         With friction in its axes.
     dt_s : float

@@ -2,7 +2,7 @@
 
 u = Phi gamma, and gamma minimises the weighted error of one plant or of a set. The design is kept
 in decoupled form (appendix E): functions Psi and targets T with C = Psi T', so that a command costs
-two thin products, whatever the plant was.
+two thin products for any plant.
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ Array = NDArray[np.float64]
 RANK_TOLERANCE = 1e-12
 """Filtered functions count as dependent below this singular value, relative to the largest."""
 _DEPENDENT = 1e-13
-"""The same for the functions themselves."""
+"""The same for the unfiltered functions."""
 _SILENT = 1e-9
 """Inputs whose output is smaller, relative to the largest, count as silent."""
 
 
 @dataclass(frozen=True, slots=True)
 class Solvability:
-    """What the least squares problem (2.10) was like.
+    """Conditioning of the least-squares problem (2.10).
 
     Attributes
     ----------
     functions, rank : int
-        Functions given, and how many of them are independent after the plant.
+        Number of functions, and of those independent after the plant.
     condition : float
         Largest over smallest singular value of the filtered functions.
     tolerance : float
@@ -59,7 +59,7 @@ class Solvability:
 
     @property
     def unique(self) -> bool:
-        """Whether the coefficients are unique; otherwise the shortest ones are taken."""
+        """Whether the coefficients are unique; otherwise the minimum-norm ones are used."""
         return self.rank == self.functions
 
 
@@ -114,8 +114,8 @@ class FullPreview:
     functions : ndarray, shape (cols, rank)
         Psi: decoupled functions; the first k of them span the first k of the basis, if unique.
     targets : ndarray, shape (rows, rank)
-        T: psi_i is commanded as much as the path shows of t_i. One unweighted plant: the filtered
-        Psi, with orthonormal columns (E.1).
+        T: the coefficient of psi_i is the path's projection on t_i. For one unweighted plant: the
+        filtered Psi, with orthonormal columns (E.1).
     transform : ndarray, shape (rank, n)
         Omega of (E.3): Phi = Psi Omega, upper triangular with positive diagonal if unique.
     report : Solvability
@@ -124,7 +124,7 @@ class FullPreview:
     ------
     DesignError
         If there are more functions than samples, the functions are dependent before the plant,
-        the plant answers none of them, or shapes do not agree.
+        the plant responds to none of them, or shapes do not match.
     """
 
     def __init__(
@@ -168,14 +168,14 @@ class FullPreview:
         self.targets = targets if weighting is None else weighting.apply_adjoint(targets)
 
     def coefficients(self, y_d: ArrayLike, free: ArrayLike = 0.0) -> Array:
-        """Return gamma of (2.10), shape (n,) or (n, k), the shortest one if it is not unique.
+        """Return gamma of (2.10), shape (n,) or (n, k), of minimum norm if not unique.
 
         Parameters
         ----------
         y_d : array_like, shape (rows,) or (rows, k)
             Desired outputs.
         free : array_like, broadcast to y_d
-            What the plant does without a command: O x0 of a nonzero initial state.
+            Output of the plant without a command: O x0 of a nonzero initial state.
         """
         seen = self._seen(y_d, free)
         if self.report.unique:
@@ -204,7 +204,7 @@ class FullPreview:
         Raises
         ------
         DesignError
-            If the filtered functions are dependent: then there is no order among them.
+            If the filtered functions are dependent: then they have no order.
         """
         if not self.report.unique:
             raise DesignError(
@@ -220,7 +220,7 @@ class FullPreview:
         return shares[:, np.asarray(counts) - 1]
 
     def initial_state(self, y_d: ArrayLike) -> Array:
-        """Return X gamma, the state in which the plant must start when filters had states."""
+        """Return X gamma, the required initial state of the plant if filters had states."""
         if self._states is None:
             raise DesignError("this design was made without filter initial states")
         return np.asarray(self._states @ self.coefficients(y_d), np.float64)

@@ -1,10 +1,10 @@
-"""Approximate inverses of a plant: several treatments of zeros that cannot be cancelled.
+"""Approximate inverses of a plant, with several treatments of zeros that cannot be cancelled.
 
 With the plant in the shift operator q,
 
     G(q) = G(1) * N(q) * b(q),   b(q) = prod (q - a) / (1 - a) over the uncancellable zeros,
 
-everything in N is inverted as it is, and the five methods differ in the X that stands for 1 / b:
+N is inverted exactly, and the five methods differ in the X that approximates 1 / b:
 
 =============  ==========================================  ================================
 kind           X                                           F G = b X
@@ -16,8 +16,8 @@ kind           X                                           F G = b X
 ``ts``         first n1 terms of the series of 1 / b       1 - (q / a)^n1 for a single zero
 =============  ==========================================  ================================
 
-Every method looks ahead by the plant's delay and by what its X asks for; the filters are
-non-causal, on arrays that are known from end to end.
+Every method looks ahead by the plant's delay and the order of its X: the filters are non-causal and
+need the whole array.
 
 Sources: Tomizuka 1987 (zpetc); Butterworth, Pao, Abramovitch 2012 (npz-ignore, zmetc); Torfs, De
 Schutter, Swevers 1992 (ebzpetc); Gross, Tomizuka, Messner 1994 (ts), as reviewed in paper 003,
@@ -55,7 +55,7 @@ class TwoSidedFilter:
     Attributes
     ----------
     preview : int
-        Samples that the output runs ahead; negative: a delay.
+        Samples by which the output leads; negative: a delay.
     taps : ndarray, shape (k,)
         T, the coefficients of q^0, q^-1, ...
     sections : ndarray, shape (s, 6), or None
@@ -68,14 +68,14 @@ class TwoSidedFilter:
 
     @property
     def dc_gain(self) -> float:
-        """Answer to a constant."""
+        """Gain at zero frequency."""
         gain = float(np.sum(self.taps))
         if self.sections is not None:
             gain *= float(np.prod(self.sections[:, :3].sum(1) / self.sections[:, 3:].sum(1)))
         return gain
 
     def response(self, f_hz: ArrayLike, dt_s: float) -> Roots:
-        """Return the frequency response at `f_hz`, from samples to samples."""
+        """Return the discrete frequency response at `f_hz`."""
         late = np.exp(-2j * np.pi * np.atleast_1d(np.asarray(f_hz, float)) * dt_s)
         value = np.polynomial.polynomial.polyval(late, self.taps) * late ** (-self.preview)
         for b0, b1, b2, a0, a1, a2 in [] if self.sections is None else self.sections:
@@ -114,7 +114,7 @@ class TwoSidedFilter:
         half = 0 if fir is None else len(fir) // 2
         taps = self.taps if fir is None else np.convolve(self.taps, fir)
         ahead = self.preview + half
-        # Relative to the first value, all that came before is zero; nothing has to settle.
+        # Relative to the first value, the past is zero and there is no transient.
         origin = float(values[0])
         padded = np.pad(values - origin, (max(-ahead, 0), max(ahead, 0)), mode="edge")
         out = np.convolve(padded, taps)[: len(padded)]
@@ -138,7 +138,7 @@ class Inversion:
     command : TwoSidedFilter
         F, from desired position to command.
     overall : TwoSidedFilter
-        L = F G, from desired to actual position; what the cancelled roots leave.
+        L = F G, from desired to actual position, without the cancelled roots.
     """
 
     kind: str
@@ -167,7 +167,7 @@ class Inversion:
     def lifted_error(self, samples: int) -> Array:
         """Return E, shape (samples, samples): the matrix of 1 - F G (paper 003, 2.28, 2.29).
 
-        It holds for a desired position that goes on beyond the ends: I - G C has a few rows more
+        It applies to a desired position that continues beyond the ends: I - G C has a few more rows
         of error at its end, where the preview is missing.
         """
         return np.asarray(np.eye(samples) - self.overall.lifted(samples))
@@ -209,7 +209,7 @@ def invert(
     Raises
     ------
     DesignError
-        If the plant or one of its uncancellable zeros is beyond the method; says which and why.
+        If the method cannot handle the plant or one of its zeros; the message says which and why.
     """
     if kind not in KINDS:
         raise DesignError(f"no inversion is called {kind!r}; there are {', '.join(KINDS)}")
@@ -331,7 +331,7 @@ def _toeplitz_norm(h: Array) -> float:
 
 
 def _place(zero: complex, dt_s: float) -> str:
-    """Name a zero on the unit circle for a message."""
+    """Describe a zero on the unit circle for a message."""
     f_hz = abs(float(np.angle(zero))) / (2 * math.pi * dt_s)
     return f"z = {_number(zero)} lies on the unit circle ({f_hz:.4g} Hz)"
 

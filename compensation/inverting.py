@@ -1,8 +1,8 @@
-"""Approximate inversion as a compensator: X and Y, low-passed until the machine can follow.
+"""Approximate inversion as a compensator, low-passed until the machine can follow.
 
-An inverse grows with frequency, and so does the error that uncancellable zeros leave. A zero-phase
-low-pass takes both out; its corner is the highest of a ladder whose command keeps the machine's
-limits (docs/method.md, "Other methods").
+The gain of an inverse grows with frequency, and so does the error due to uncancellable zeros. A
+zero-phase low-pass limits both; its corner is the highest of a ladder whose command keeps the
+machine's limits (docs/method.md, "Other methods").
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ Array = NDArray[np.float64]
 _FASTEST_HZ, _SLOWEST_HZ, _STEP = 400.0, 15.0, 0.85
 _BLEND_S = 0.03
 _EXTRA_TERMS = 3
-"""Terms that ebzpetc adds to zpetc: they bring the error of a zero at -3.7 below a fifth."""
+"""Terms that ebzpetc adds to zpetc: enough for less than a fifth of the error of a zero at -3.7."""
 _LEFT, _MOST_TERMS = 1e-3, 400
-"""Largest remainder of the slowest zero in the series of ts, and most terms to get there."""
+"""Largest remainder of the slowest zero in the series of ts, and largest number of terms."""
 
 
 def zero_phase_fir(
@@ -60,8 +60,7 @@ class InversionCompensator(Memoryless):
     kind : str
         A key of `compensation.inversion.KINDS`.
     order : int or None
-        n1 of ``ebzpetc`` and ``ts``. None: 3, and as many as bring what the series leaves below
-        0.1 %.
+        n1 of ``ebzpetc`` and ``ts``. None: 3, and as many as leave a remainder below 0.1 %.
     cutoff_hz : float or None
         Corner of the low-pass. None: for every run the highest of a ladder from 400 to 15 Hz
         whose command stays within the machine's limits.
@@ -122,7 +121,7 @@ class InversionCompensator(Memoryless):
 
 
 def _designed(kind: str, axis: str, plant: DiscretePlant, order: int | None) -> Inversion:
-    """Invert one axis; n1 by the zeros where it is not given."""
+    """Invert one axis, choosing n1 by the zeros if not given."""
     try:
         if order is None:
             order = _enough_terms(invert("zpetc", plant)) if kind == "ts" else _EXTRA_TERMS
@@ -135,7 +134,7 @@ def _designed(kind: str, axis: str, plant: DiscretePlant, order: int | None) -> 
 
 
 def _enough_terms(design: Inversion) -> int:
-    """Terms of ts after which the slowest zero has decayed."""
+    """Return the terms of ts after which the slowest zero has decayed."""
     if len(design.uncancelled) == 0:
         return 1
     slowest = float(np.abs(np.log(np.abs(design.uncancelled))).min())
@@ -150,7 +149,7 @@ def _enough_terms(design: Inversion) -> int:
 
 
 def _check_convergence(plant: DiscretePlant) -> None:
-    """Raise where more terms make ebzpetc worse: the gain of zpetc must stay below 2."""
+    """Raise if more terms make ebzpetc worse: the gain of zpetc must stay below 2."""
     f_hz = np.linspace(0.0, 0.5 / plant.dt_s, 2001)
     gain = np.abs(invert("zpetc", plant).overall.response(f_hz, plant.dt_s))
     if gain.max() >= 2.0:
@@ -162,7 +161,7 @@ def _check_convergence(plant: DiscretePlant) -> None:
 
 
 def _passes(design: Inversion) -> int:
-    """How often to low-pass: where F G grows with frequency, order two is too weak."""
+    """Return the passes of the low-pass: where F G grows with frequency, one is too weak."""
     peak = np.abs(design.overall.response(np.linspace(0.0, 0.5, 501), 1.0)).max()
     return 1 if peak < 2.0 else 3
 

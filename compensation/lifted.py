@@ -1,7 +1,7 @@
 """Plants and plant sets in lifted form: from models to operators and Gram matrices.
 
-A set of plants is kept as two matrices, A = sum l_j G_j'G_j and B = sum l_j G_j, which is all that
-a robust basis or nominal model needs, however many plants there are.
+A set of plants is stored as two matrices, A = sum l_j G_j'G_j and B = sum l_j G_j, which is all
+that a robust basis or nominal model needs, for any number of plants.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ __all__ = [
 Array = NDArray[np.float64]
 
 _WEIGHT_SUM = 1e-9
-"""Weights of a set may miss the sum 1 by this much."""
+"""Tolerance of the sum 1 of weights."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LiftedSet:
-    """A weighted set of plants, in what robust designs need of it.
+    """A weighted set of plants, reduced to what robust designs need.
 
     Attributes
     ----------
@@ -58,8 +58,7 @@ def lift(plant: DiscretePlant | ArrayLike, samples: int) -> ToeplitzOperator:
     Parameters
     ----------
     plant : DiscretePlant or array_like, shape (k,)
-        A discrete plant, or its Markov parameters or FIR taps: what lies beyond `samples` does not
-        count, what is missing is zero.
+        A discrete plant, or its Markov parameters or FIR taps, cut or zero-padded to `samples`.
     samples : int
         M + 1.
 
@@ -87,7 +86,7 @@ def time_varying(
     Parameters
     ----------
     plants : sequence of DiscretePlant
-        All of one order and in the same coordinates: the state is handed over as it is.
+        All of one order and in the same coordinates, since the state is passed on unchanged.
     starts : sequence of int
         First sample of each plant: 0, then rising.
     samples : int

@@ -1,9 +1,9 @@
 """A plant, or a weighted set of plants, over one preview window.
 
-The members of a set answer almost alike. Their responses to command increments, as rows sqrt(l_j)
-h_j of one matrix, are therefore written in its leading right singular vectors: a few *components*
-whose squared errors add up to those of all members, whatever the weights of the samples. A set of
-ten costs about as much as five plants, and one plant is its own component.
+The members of a set respond almost alike. Their responses to command increments, as rows sqrt(l_j)
+h_j of one matrix, are therefore expressed in its leading right singular vectors: a few *components*
+whose squared errors sum to those of all members, for any weights of the samples. A set of ten costs
+about as much as five plants, and one plant is its own component.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ __all__ = ["Condensed", "LiftedWindow", "condensed", "lifted_window"]
 Array = NDArray[np.float64]
 
 _TOLERANCE = 1e-5
-"""Components below this share of the largest are left out: of a move of 10 mm, .1 um."""
+"""Components below this share of the largest are dropped: .1 um of a 10 mm move."""
 _COARSE = 1e-3
-"""The same for windows with rests, which pay for every component. Often the mean response alone is
-left; `benchmarks/twins.py` has the same errors with it as with 1e-5."""
+"""The same for windows with rests, where every component is costly. Often only the mean response
+remains; `benchmarks/twins.py` gives the same errors as with 1e-5."""
 _HANKEL = 1e-5
-"""States whose Hankel singular value is a smaller share of the largest are left out of them."""
+"""There, states with a smaller Hankel singular value relative to the largest are dropped."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LiftedWindow:
-    """Plants lifted over a window, seen from the increments v of the command.
+    """Plants lifted over a window, with the increments v of the command as input.
 
     With z = [x_1 .. x_l, u1, u2] (states of all members, last two commands), component k of the
     error over the window is
@@ -57,16 +57,16 @@ class LiftedWindow:
     integrated : ndarray, shape (components, window, window)
         Lower-triangular Toeplitz: increments to position.
     mix : ndarray, shape (components, l)
-        What each member's error counts in each component.
+        Weight of each member's error in each component.
     target : ndarray, shape (components,)
-        Its sum over the members: the share of a path that all of them shall follow.
+        Its sum over the members: a component's target per unit of a path common to all.
     from_state : ndarray, shape (components, window, nz)
-        Free response, the command going on in a straight line.
+        Free response with the command continued in a straight line.
     advance : ndarray, shape (nz - 2, nz - 2)
         States after `update` samples without a command.
     reach : ndarray, shape (nz - 2, window)
-        States after the window, from its samples of the command; the last m columns are the same
-        for m samples.
+        Maps the window's command samples to the states after it; the last m columns do so for m
+        samples.
     """
 
     plants: tuple[DiscretePlant, ...]
@@ -91,7 +91,7 @@ class LiftedWindow:
 
     @property
     def drive(self) -> Array:
-        """States after `update` samples from those of the command, shape (nz - 2, update)."""
+        """Map from `update` command samples to the states after them, shape (nz - 2, update)."""
         return self.reach[:, self.window - self.update :]
 
     def lifted_set(self) -> LiftedSet:
@@ -100,7 +100,7 @@ class LiftedWindow:
         return lifted_set(markov, self.weights)
 
     def rest_state(self, position_mm: float) -> Array:
-        """Vector z of an axis that stands at `position_mm`."""
+        """Return z of an axis that stands at `position_mm`."""
         parts = [p.rest_state(position_mm) for p in self.plants]
         return np.concatenate([*parts, np.full(2, position_mm)])
 
@@ -114,7 +114,7 @@ def lifted_window(
     ----------
     plants : sequence of DiscretePlant
     weights : sequence of float
-        Of the members, positive, sum 1.
+        Weights of the members, positive, sum 1.
     window, update : int
         Samples in the window and samples committed.
 
@@ -132,7 +132,7 @@ def lifted_window(
     markov = np.array([integrated(p.impulse_response(window)) for p in plants])
     u, s, vt = np.linalg.svd(roots[:, None] * markov, full_matrices=False)
     count = int(np.sum(s > _TOLERANCE * s[0]))
-    # Singular vectors are free in sign; fix it so that the same model gives the same bytes.
+    # The sign of singular vectors is arbitrary; fix it so that the same model gives the same bytes.
     sign = np.sign(vt[np.arange(len(s)), np.argmax(np.abs(vt), axis=1)])
     mix = (u * sign)[:, :count].T * roots
     components = (s * sign)[:count, None] * vt[:count]
@@ -168,17 +168,17 @@ def lifted_window(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Condensed:
-    """The part of a lifted set that counts, for windows that are solved by themselves.
+    """Reduced form of a lifted set for windows that are solved individually.
 
     Attributes
     ----------
     components : int
-        The leading ones.
+        Number of leading components kept.
     squeeze : ndarray, shape (k, nz - 2)
-        From the members' states to few, in balanced coordinates.
+        Maps the members' states to a few in balanced coordinates.
     from_state : ndarray, shape (components, window, k + 2)
     reach : ndarray, shape (k, window)
-        As those of `LiftedWindow`, for these.
+        As in `LiftedWindow`, for the reduced states.
     """
 
     components: int
@@ -188,7 +188,7 @@ class Condensed:
 
 
 def condensed(lifted: LiftedWindow) -> Condensed:
-    """Leave out what many similar members differ in too little to count.
+    """Reduce a lifted set by dropping negligible components and states.
 
     Source: balanced truncation (B. C. Moore, IEEE Trans. Autom. Control 26, 1981), with the
     Gramians of the window instead of infinite ones.

@@ -1,9 +1,9 @@
-"""One time-invariant preview filter an axis: the compensation for use at print time.
+"""A time-invariant preview filter per axis, for compensation at print time.
 
-A firmware that prints sees some hundredths of a second of its plan ahead. A finite impulse
-response over +-80 ms fits into that: u(k) = sum_j h(j) y_d(k - j). It is designed on the members
-of a plant set at once, and moves neither what stands nor what moves at constant speed: its gain at
-zero frequency is 1 and its first moment 0, exactly.
+A printing firmware knows its plan some hundredths of a second ahead. A finite impulse response over
++-80 ms fits into that: u(k) = sum_j h(j) y_d(k - j). It is designed for all members of a plant set
+at once. Standstill and constant speed pass unchanged: its DC gain is exactly 1 and its first moment
+exactly 0.
 """
 
 from __future__ import annotations
@@ -25,24 +25,24 @@ Array = NDArray[np.float64]
 REACH = 80
 """Taps on either side, samples of 1 ms."""
 FADE = 24
-"""Samples in which the filter fades out before, and in after, what limits forbid."""
+"""Samples in which the filter fades out before, and in after, motion that limits forbid."""
 _FREQUENCIES = 1001
 _SLOW_HZ, _FAST_HZ = 1.0, 20.0
-"""The spectrum of printed motion: acceleration is white between them, as 1/f above."""
+"""Corners of the spectrum of printed motion: acceleration is flat between them, ~ 1/f above."""
 
 
 @dataclass(frozen=True, slots=True)
 class LiveFilter:
-    """What the extra of Klipper does with a plan, sample by sample.
+    """The filter that the extra inside Klipper applies to a plan.
 
     Attributes
     ----------
     taps : ndarray, shape (2, 2 reach + 1)
-        Of X and Y; tap `reach + j` weighs the plan j samples earlier.
+        Taps of X and Y; tap `reach + j` weights the plan j samples earlier.
     dt_s, velocity_mm_s, accel_mm_s2 : float
-        Sampling time, and what the command of an axis may ask for.
+        Sampling time, and limits of the command of an axis.
     bounds_mm : ndarray, shape (2, 2)
-        Where X and Y may go.
+        Travel of X and Y.
     """
 
     taps: Array
@@ -69,7 +69,7 @@ class LiveFilter:
         Returns
         -------
         ndarray, shape (2, n - 2 margin)
-            Places at the samples of a motion whose acceleration is constant between their middles.
+            Samples of a motion whose acceleration is constant between the midpoints of samples.
         """
         reach = self.taps.shape[1] // 2
         plan = path_mm[:, reach:-reach]
@@ -88,7 +88,7 @@ class LiveFilter:
             share = np.ones(len(allowed) - 4 * FADE)
         cut = 2 * FADE + 1
         points = plan[:, cut:-cut] + share * away[:, cut:-cut]
-        # What lies on a quadratic B-spline with these points.
+        # Values of the quadratic B-spline with these control points.
         return np.asarray((points[:, :-2] + 6.0 * points[:, 1:-1] + points[:, 2:]) / 8.0)
 
     def _allowed(self, plan: Array, away: Array) -> Array:
@@ -117,11 +117,11 @@ def design_taps(
     Parameters
     ----------
     members : sequence of DiscretePlant
-        DC gain 1, slow motion on time, all at one sampling time.
+        With DC gain 1, no delay of slow motion, and one sampling time.
     weights : ndarray, shape (len(members),)
-        How likely each of them is; sum 1.
+        Probability of each member; sum 1.
     corner_hz : float
-        Where the command's acceleration begins to cost as much as the error it removes.
+        Frequency from which the command's acceleration outweighs the error it removes.
 
     Returns
     -------
@@ -132,31 +132,31 @@ def design_taps(
     Least squares in frequency: sum_m w_m |1 - B G_m H|^2 S + (f / corner)^4 |H|^2 S, S the
     spectrum of acceleration-limited motion and B that of the quadratic B-spline which the motors
     follow. The members enter by P = sum_m w_m |B G_m|^2 and C = sum_m w_m conj(B G_m) / P (the
-    ensemble of `docs/method.md` in frequency; dissertation (4.22)). Gain and first moment are
-    taken out of the unknowns.
+    ensemble of `docs/method.md` in frequency; dissertation (4.22)). The constraints on gain and
+    first moment are eliminated from the unknowns.
     """
     dt_s = members[0].dt_s
     f = np.linspace(0.0, 0.5 / dt_s, _FREQUENCIES)[1:]
     spline = 0.75 + 0.25 * np.cos(2.0 * np.pi * f * dt_s)
-    answers = [spline * m.frequency_response(f) for m in members]
-    power = sum(w * np.abs(g) ** 2 for w, g in zip(weights, answers, strict=True))
-    target = sum(w * np.conj(g) for w, g in zip(weights, answers, strict=True)) / power
+    responses = [spline * m.frequency_response(f) for m in members]
+    power = sum(w * np.abs(g) ** 2 for w, g in zip(weights, responses, strict=True))
+    target = sum(w * np.conj(g) for w, g in zip(weights, responses, strict=True)) / power
     motion = 1.0 / ((f**2 + _SLOW_HZ**2) * np.sqrt(1.0 + (f / _FAST_HZ) ** 2))
-    late = np.arange(-reach, reach + 1)
-    wave = np.exp(-2j * np.pi * dt_s * np.outer(f, late))
+    delays = np.arange(-reach, reach + 1)
+    wave = np.exp(-2j * np.pi * dt_s * np.outer(f, delays))
     error, effort = motion * np.sqrt(power), motion * (f / corner_hz) ** 2
     rows = np.concatenate([error[:, None] * wave, effort[:, None] * wave])
     wanted = np.concatenate([error * target, np.zeros(len(f))])
-    start = (late == 0).astype(float)
-    free = _moving_nothing(late)
-    left = np.concatenate([rows.real, rows.imag]) @ free
-    aim = wanted - rows @ start
-    found = np.linalg.lstsq(left, np.concatenate([aim.real, aim.imag]), rcond=1e-12)[0]
+    start = (delays == 0).astype(float)
+    free = _moving_nothing(delays)
+    matrix = np.concatenate([rows.real, rows.imag]) @ free
+    residual = wanted - rows @ start
+    found = np.linalg.lstsq(matrix, np.concatenate([residual.real, residual.imag]), rcond=1e-12)[0]
     return exact_moments(start + free @ found)
 
 
 def shaper_taps(pulses: Pulses, dt_s: float, reach: int = REACH) -> Array:
-    """Return a firmware shaper, centred, as such a filter; pulses between samples are shared.
+    """Return a centred firmware shaper as taps; pulses between samples are split.
 
     Raises
     ------
@@ -175,7 +175,7 @@ def shaper_taps(pulses: Pulses, dt_s: float, reach: int = REACH) -> Array:
 
 
 def exact_moments(taps: Array) -> Array:
-    """Take the last digits out of gain and first moment: 1 and 0."""
+    """Return taps corrected for rounding: gain exactly 1, first moment exactly 0."""
     late = np.arange(len(taps)) - len(taps) // 2
     reach = float(late @ late)
     for _ in range(3):
@@ -186,6 +186,6 @@ def exact_moments(taps: Array) -> Array:
 
 
 def _moving_nothing(late: NDArray[np.int64]) -> Array:
-    """Return a basis, (n, n - 2), of filters without gain and first moment."""
+    """Return a basis, (n, n - 2), of filters with zero gain and first moment."""
     held = np.stack([np.ones(len(late)), late / np.abs(late).max()])
     return np.asarray(np.linalg.svd(held)[2][2:].T)

@@ -1,9 +1,9 @@
 """Accuracy of a lifted controller without knowledge of the path (paper 003, 2.5 to 4.4).
 
 Frobenius norms of the error and of the controller, divided by the root of the number of samples:
-expected rms error and command for white noise of rms 1. For smooth paths they order designs and
-forecast nothing. Every metric exists twice, from matrices and in the closed form that holds for
-filtered basis functions; n counts functions, the paper's n + 1.
+expected rms error and command for white noise of rms 1. For smooth paths they rank designs but do
+not predict errors. Every metric exists twice, from matrices and in the closed form for filtered
+basis functions; n counts functions, the paper's n + 1.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def effort_of_ce_opt(singular_values: ArrayLike, n: int) -> float:
     Raises
     ------
     DesignError
-        If the plant does not answer n functions.
+        If the plant responds to fewer than n directions.
     """
     sigma = np.asarray(singular_values, np.float64)
     if not 1 <= n <= len(sigma) or sigma[n - 1] <= 0:
@@ -74,7 +74,7 @@ def effort_of_ce_opt(singular_values: ArrayLike, n: int) -> float:
 def robust_error_metric(members: LiftedSet, controller: Array) -> float:
     """Return J_e,r = sqrt(sum_j l_j |I - G_j C|_F^2 / rows) (4.2), C of shape (inputs, rows).
 
-    Computed from the Gram matrices of the set, without the single plants.
+    Computed from the Gram matrices of the set, without the individual plants.
     """
     rows = len(members.mean)
     cross = float(np.sum(members.mean * controller.T))

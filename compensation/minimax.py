@@ -1,4 +1,4 @@
-"""Weights of a plant set with which least squares protects the worst member.
+"""Find weights of a plant set with which least squares minimises the worst member's error.
 
 For a command u = C y_d the expected squared error of member j is e_j^2 = sum_w S |1 - G_j C|^2, S
 the spectrum of the path. The least weighted sum over all C,
@@ -30,12 +30,12 @@ _NEGLIGIBLE = 1e-4
 
 
 def path_spectrum(f_hz: ArrayLike) -> Array:
-    """Power spectrum of a path with corners, up to a factor: its speed steps, so f^-4."""
+    """Return the power spectrum of a path with corners, up to a factor: f^-4, as speed steps."""
     return np.asarray(f_hz, float) ** -4.0
 
 
 def member_errors(responses: ArrayLike, spectrum: ArrayLike, weights: ArrayLike) -> Array:
-    """Mean squared error of every member under the least-squares command for `weights`.
+    """Return the mean squared error of every member under the least squares for `weights`.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def member_errors(responses: ArrayLike, spectrum: ArrayLike, weights: ArrayLike)
 
 
 def worst_case_weights(responses: ArrayLike, spectrum: ArrayLike) -> Array:
-    """Weights on the simplex for which least squares has the smallest worst error.
+    """Return the weights on the simplex for which least squares has the smallest worst error.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ def worst_case_weights(responses: ArrayLike, spectrum: ArrayLike) -> Array:
 
     from scipy.optimize import minimize  # slow to import, seldom needed
 
-    found = minimize(  # type: ignore[call-overload]
+    result = minimize(  # type: ignore[call-overload]
         loss,
         np.full(members, 1.0 / members),
         jac=True,
@@ -92,15 +92,15 @@ def worst_case_weights(responses: ArrayLike, spectrum: ArrayLike) -> Array:
         constraints={"type": "eq", "fun": lambda share: share.sum() - 1.0, "jac": np.ones_like},
         options={"maxiter": 300, "ftol": 1e-10},
     )
-    share = np.where(found.x > _NEGLIGIBLE, found.x, 0.0)
+    share = np.where(result.x > _NEGLIGIBLE, result.x, 0.0)
     return np.asarray(share / share.sum())
 
 
 @lru_cache(maxsize=32)
 def guarded_weights(plants: PlantSet) -> Array:
-    """Half the set's own weights, half the worst-case weights for a path with corners.
+    """Return the mean of the set's own weights and the worst-case weights for a path with corners.
 
-    The worst-case weights alone leave most members out, whatever these then do.
+    The worst-case weights alone ignore most members.
     """
     f_hz = np.linspace(_LOWEST_HZ, min(_HIGHEST_HZ, 0.45 / plants.dt_s), _POINTS)
     responses = np.array([p.frequency_response(f_hz) for p in plants.members])

@@ -1,7 +1,7 @@
 """Nominal models for robust design, in the lifted domain (paper 003, sections 4.3 to 4.5).
 
-Everything is computed from A = sum l_j G_j'G_j and B = sum l_j G_j of a `LiftedSet`, never from the
-plants one by one: Delta'Delta = A - G'B - B'G + G'G.
+Everything is computed from A = sum l_j G_j'G_j and B = sum l_j G_j of a `LiftedSet`, not from
+individual plants: Delta'Delta = A - G'B - B'G + G'G.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ PSEUDO_INVERSE_TOLERANCE = 1e-10
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TwoStep:
-    """A robust design by remark 4.7.
+    """A robust design according to remark 4.7.
 
     Attributes
     ----------
@@ -37,9 +37,9 @@ class TwoStep:
     singular_values : ndarray, shape (cols - r,)
         Of Delta_nom,s, rising.
     best : int
-        Number of functions that is best by remark 4.5 (n + 1 in the paper's count).
+        Best number of functions by remark 4.5 (n + 1 in the paper's count).
     r : int
-        Directions left out.
+        Number of directions left out.
     """
 
     nominal: Array
@@ -102,13 +102,12 @@ def two_step(
     nominal : ndarray, shape (rows, cols), optional
         A given nominal model; by default (4.28).
     r : int, optional
-        Directions to leave out (4.10); by default those that are answered by less than 1e-7 of
-        the best.
+        Directions to leave out (4.10); by default those with less than 1e-7 of the largest gain.
 
     Raises
     ------
     DesignError
-        If n functions do not fit into what the plants answer.
+        If the plants respond to fewer than n directions.
     """
     if nominal is None:
         # Identical to the other branch with (4.28), without the singular values of G_nom.

@@ -6,19 +6,19 @@ inverse when they are filtered with
 
     G_r = E[|G|^2] / E[G*]                                                              (I.3)
 
-in place of a nominal plant. What is expected depends on the distribution over the region:
+in place of a nominal plant. The expectations depend on the distribution over the region:
 
-- ``sampled``: the given responses with their weights, magnitude and phase belonging together;
+- ``sampled``: the given responses with their weights, magnitude and phase paired;
 - ``uniform``: even over the box r_min..r_max, theta_min..theta_max of (I.4);
 - ``kernel``: normal kernels about every sample's magnitude, and about every sample's phase, taken
   as independent of each other and cut off at the box (I.5, I.6).
 
-For the last two an element of the region is r dr dtheta, as (I.6) has it: of two equally frequent
-magnitudes the larger one counts more.
+For the last two the area element is r dr dtheta, as in (I.6): of two equally frequent magnitudes
+the larger one counts more.
 
-G_r is no plant: its magnitude and its phase follow from different averages, so its impulse
-response runs ahead of time even if all plants are causal. It is returned as the two-sided impulse
-response; a lifted design takes it as it is.
+G_r is not a plant: its magnitude and phase follow from different averages, so its impulse response
+is non-causal even if all plants are causal. It is returned as a two-sided impulse response, which a
+lifted design uses directly.
 """
 
 from __future__ import annotations
@@ -53,11 +53,11 @@ Distribution = Literal["sampled", "uniform", "kernel"]
 _Integrands = Callable[[Array], Responses]
 
 CAUSAL_SHARE = 1e-4
-"""Energy of the response that may lie ahead of time in what still counts as causal (1 % rms)."""
+"""Largest share of non-causal energy in a response that still counts as causal (1 % rms)."""
 _LEAST_TRACKED = 1e-6
-"""Below this share of tracked energy the phases have no common direction."""
+"""Below this share of tracked energy the phases are spread in all directions."""
 _UNSETTLED = 1e-3
-"""Energy in the outer half of the time grid from which on it is too short."""
+"""Share of energy in the outer half of the time grid above which the grid is too short."""
 _NODES = 48
 _REACH = 8.0
 """Kernels are integrated over this many standard deviations on either side."""
@@ -118,17 +118,16 @@ class FrequencyNominal:
 
     @property
     def ahead_share(self) -> float:
-        """Energy of the response ahead of time, as a share of all."""
+        """Share of the response's energy that is non-causal."""
         early = float(self.ahead @ self.ahead)
         return early / (early + float(self.markov @ self.markov))
 
     def operator(self, samples: int) -> ToeplitzOperator:
         """Return G_r over a number of samples, as filtered basis functions take it.
 
-        With the part ahead of time: the lifted system may be non-causal, nothing is lost. Take
-        `needed_delay` samples more than the path has, hold the path there and drop the commands
-        for them: a design that ends with its path spends huge ones on its last samples, where
-        those that G_r looks ahead to are missing.
+        It includes the non-causal part. Use `needed_delay` more samples than the path has, hold the
+        path there, and drop their commands: otherwise the last commands are huge, because the
+        samples that G_r looks ahead to are missing.
         """
         markov = np.zeros(samples)
         used = min(samples, len(self.markov))
@@ -141,8 +140,8 @@ class FrequencyNominal:
         Raises
         ------
         DesignError
-            If more than `CAUSAL_SHARE` of the response's energy lies ahead of time: a causal filter
-            with this frequency response would be unstable, or there is none.
+            If more than `CAUSAL_SHARE` of the response's energy is non-causal: a causal filter with
+            this frequency response would be unstable, or does not exist.
         """
         if self.ahead_share > CAUSAL_SHARE:
             raise DesignError(
@@ -153,9 +152,9 @@ class FrequencyNominal:
         return self.markov.copy()
 
     def needed_delay(self, limit: float = CAUSAL_SHARE) -> int:
-        """Return the fewest samples of delay that leave at most `limit` ahead of time."""
+        """Return the smallest delay in samples that leaves at most `limit` non-causal energy."""
         energy = float(self.ahead @ self.ahead + self.markov @ self.markov)
-        # left[d]: energy ahead of time after a delay of d samples.
+        # left[d]: non-causal energy after a delay of d samples.
         left = np.append(np.cumsum(self.ahead[::-1] ** 2)[::-1], 0.0)
         return int(np.argmax(left <= limit * energy))
 
@@ -192,7 +191,7 @@ def extended_response(
     """Bring a measured response to the grid of a real FFT, shape (points / 2 + 1,).
 
     Magnitude and phase are interpolated within the measured band. Beyond it the model `outside`
-    answers, joined to the measurement by a ratio that fades within an octave, and within half the
+    is used, joined to the measurement by a ratio that fades within an octave, and within half the
     lowest frequency.
 
     Parameters
@@ -220,7 +219,7 @@ def extended_response(
     grid = _grid(points, outside.dt_s)
     model = outside.frequency_response(grid)
     ratio = g / outside.frequency_response(f)
-    # The logarithm of the ratio is smooth where responses themselves turn.
+    # The logarithm of the ratio is smooth even where the responses rotate quickly.
     size, angle = np.log(np.abs(ratio)), np.unwrap(np.angle(ratio))
     inner = np.interp(grid, f, size) + 1j * np.interp(grid, f, angle)
     above = np.clip((2 * f[-1] - grid) / f[-1], 0.0, 1.0)
@@ -232,8 +231,8 @@ def bandwidths(samples: ArrayLike) -> Array:
     """Return the standard deviation of normal kernels for samples (l, f), shape (f,).
 
     Optimal for normally distributed samples: s (4 / (3 l))^(1/5), with s the median absolute
-    deviation over .6745, or the range where that is zero. It is the default of the function
-    ``fitdist`` that appendix I.3 used, and Silverman's rule with a robust s.
+    deviation over .6745, or the range where that is zero. This is Silverman's rule with a robust s,
+    the default of ``fitdist``, which appendix I.3 used.
     """
     x = np.asarray(samples, np.float64)
     spread = np.median(np.abs(x - np.median(x, axis=0)), axis=0) / 0.6745
@@ -256,7 +255,7 @@ def robust_response(
     responses : array_like, shape (l, f)
         One row per plant or measurement; all at the same frequencies.
     weights : array_like, shape (l,), optional
-        Not negative, sum 1; equal by default. The uniform distribution knows its box alone.
+        Not negative, sum 1; equal by default. Not used by the uniform distribution.
     distribution : str
         ``sampled``, ``uniform`` or ``kernel``.
     r_bandwidth, theta_bandwidth : array_like, shape (f,) or (), optional
@@ -355,7 +354,7 @@ def robust_nominal(
             )
         f_hz = _grid(points, dt_s)
     response, tracked = robust_response(responses, distribution=distribution)
-    # A real filter answers 0 Hz and the Nyquist frequency with real numbers.
+    # The response of a real filter is real at 0 Hz and at the Nyquist frequency.
     response[[0, -1]] = response[[0, -1]].real
     h = np.fft.irfft(response, points)
     half = points // 2
@@ -404,7 +403,7 @@ def _kernel_mean(
     scale = np.maximum(np.abs(samples).max(axis=0), _POINT)
     sigma = np.maximum(np.broadcast_to(sigma, span[0].shape), 1e-3 * _POINT * scale)
     low, high = span
-    # Where all samples agree there is nothing to cut off.
+    # Where all samples agree the kernel is not cut off.
     agree = high - low <= _POINT * scale
     low, high = np.where(agree, -np.inf, low), np.where(agree, np.inf, high)
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)

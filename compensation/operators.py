@@ -35,7 +35,7 @@ Array = NDArray[np.float64]
 _Product = Callable[[Array], Array]
 
 _COLUMNS = 64
-"""Columns per FFT: more would only need more memory."""
+"""Columns per FFT: more would only use more memory."""
 
 
 class LiftedOperator(ABC):
@@ -68,7 +68,7 @@ class LiftedOperator(ABC):
         return self.apply(np.eye(self.shape[1]))
 
     def as_linear_operator(self) -> LinearOperator:
-        """Return the operator as `scipy.sparse.linalg` takes it."""
+        """Return the operator in the form that `scipy.sparse.linalg` expects."""
         from scipy.sparse.linalg import LinearOperator  # slow to import, seldom needed
 
         return LinearOperator(
@@ -82,11 +82,11 @@ class LiftedOperator(ABC):
 
     @abstractmethod
     def _forward(self, u: Array) -> Array:
-        """G u for u of shape (cols, k)."""
+        """Return G u for u of shape (cols, k)."""
 
     @abstractmethod
     def _backward(self, e: Array) -> Array:
-        """G' e for e of shape (rows, k)."""
+        """Return G' e for e of shape (rows, k)."""
 
     def _checked(self, x: ArrayLike, length: int, what: str, product: _Product) -> Array:
         values = np.asarray(x, np.float64)
@@ -99,7 +99,7 @@ class LiftedOperator(ABC):
 
 
 class DenseOperator(LiftedOperator):
-    """A matrix with the calls of an operator."""
+    """A matrix with the interface of an operator."""
 
     def __init__(self, matrix: ArrayLike) -> None:
         self._matrix = np.asarray(matrix, np.float64)
@@ -196,15 +196,15 @@ class ToeplitzOperator(LiftedOperator):
 class TimeVaryingOperator(LiftedOperator):
     """A plant that changes from sample to sample (LTV, LPV); products cost O(M n^2).
 
-    The state is handed over as it is when the plant changes, so all plants must be written in the
-    same (for instance physical) coordinates. `time_varying` makes it from plants.
+    The state is passed on unchanged when the plant changes, so all plants must use the same (for
+    instance physical) coordinates. `time_varying` builds it from plants.
 
     Parameters
     ----------
     a, b, c, d : ndarray, shapes (p, n, n), (p, n), (p, n), (p,)
         p state-space plants of order n.
     which : ndarray of int, shape (m,)
-        Which of them holds at each sample.
+        Index of the plant at each sample.
     """
 
     def __init__(self, a: Array, b: Array, c: Array, d: Array, which: NDArray[np.int64]) -> None:
@@ -255,7 +255,7 @@ class BlockOperator(LiftedOperator):
     Parameters
     ----------
     blocks : sequence of rows of operators
-        `blocks[i][j]` leads from input j to output i; None where there is no way.
+        `blocks[i][j]` maps input j to output i; None: no connection.
     """
 
     def __init__(self, blocks: Sequence[Sequence[LiftedOperator | None]]) -> None:
@@ -312,7 +312,7 @@ class BlockOperator(LiftedOperator):
 
 
 class ProductOperator(LiftedOperator):
-    """One system after the other: `after` times `first` (a weighting filter, remark 3.3)."""
+    """Two systems in series: `after` times `first` (a weighting filter, remark 3.3)."""
 
     def __init__(self, after: LiftedOperator, first: LiftedOperator) -> None:
         if after.shape[1] != first.shape[0]:

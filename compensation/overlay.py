@@ -1,4 +1,4 @@
-"""Base of the compensators that are laid over another one: ripple, friction."""
+"""Base of the compensators on top of another one: ripple, friction."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ Array = NDArray[np.float64]
 class Overlay:
     """Base of compensators that add to the command of another one.
 
-    What is added is no motion that the inner compensator knows of: it keeps its own state.
+    The inner compensator does not see the addition: its state follows its own command.
 
     Parameters
     ----------
     inner : Compensator
     machine : Machine
-        Its limits of the command.
+        Source of the command limits.
     dt_s : float
     """
 
@@ -57,10 +57,9 @@ class Overlay:
         return self._inner.ease(accel_share)
 
     def _kept(self, u: Array, wanted: Array) -> bool:
-        """Return whether a command keeps each axis' limits, or asks for no more than `wanted`.
+        """Return whether a command keeps each axis' limits, or needs no more than `wanted`.
 
-        What the inner compensator asks for is its own business; what is laid over it must not add
-        to that.
+        The inner compensator may exceed the limits; the addition must not make that worse.
         """
         for order, limits in ((1, self._speed_mm_s), (2, self._accel_mm_s2)):
             asked, own = (

@@ -3,13 +3,13 @@
 A window starts with the plant states x and the last two commands u1, u2 known. The command
 continues in a straight line (u_free) plus the double running sum of v = Psi c; c minimises the
 error over the window, the first `update` samples are committed, and the window moves on
-(docs/method.md). Everything that does not depend on the path is folded into constant gains, so
-that a window without a rest costs one matrix product:
+(docs/method.md). Everything independent of the path is folded into constant gains, so that a window
+without a rest costs one matrix product:
 
     u_up = E z + S y_d        z = [x_1 .. x_l, u1, u2]
     z'   = F z + H y_d
 
-The design refuses itself when the recursion is unstable or the basis nearly dependent.
+The design fails if the recursion is unstable or the basis nearly dependent.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 MAX_SPECTRAL_RADIUS = 0.9
 MAX_CONDITION = 1e10
 _NODE_TOLERANCE = 1e-11
-"""What nodes leave out, as a share of the largest row: below 1 nm on a path of 200 mm."""
+"""Interpolation error of the nodes relative to the largest row: below 1 nm on a 200 mm path."""
 
 
 class PreviewDesign:
@@ -48,11 +48,11 @@ class PreviewDesign:
     basis : str
         A key of `compensation.basis.BASES`.
     price : float
-        Price of squared increments (mm/sample^2)^2 against squared error mm^2. A small price
-        bends the sharp cut-off at n into a slope, which asks for less acceleration at the same
+        Weight of squared increments (mm/sample^2)^2 relative to squared error mm^2. A small weight
+        turns the sharp cut-off at n into a slope, which needs less acceleration for the same
         accuracy.
     psi : ndarray, shape (window, >= n), optional
-        Functions made before, most important first; the first n of them are used.
+        Precomputed functions, most important first; the first n are used.
 
     Attributes
     ----------
@@ -60,12 +60,12 @@ class PreviewDesign:
     command_gain, path_gain : ndarray
         E, shape (update, nz), and S, shape (update, window).
     nodes, spread : ndarray, shapes (k,) and (update, k)
-        Some samples of the update, and all of them from these: the functions' commands are smooth,
-        S = spread S[nodes].
+        Some samples of the update, and the interpolation to all of them, S = spread S[nodes]: the
+        functions' commands are smooth.
     target_gain : ndarray, shape (components, k, window)
-        S[nodes] for targets of each component's own; weighted by `lifted.target` they sum to it.
+        S[nodes] for separate targets of each component; weighted by `lifted.target` they sum to it.
     state_gain, state_drive : ndarray
-        F, shape (nz, nz), and what z becomes by S y_d, shape (nz, update): H = state_drive S.
+        F, shape (nz, nz), and the effect of S y_d on z, shape (nz, update): H = state_drive S.
     basis : ndarray, shape (window, n)
         Psi scaled so that its filtered columns are orthonormal over the (weighted) members.
     summed : ndarray, shape (window, n)
@@ -76,12 +76,12 @@ class PreviewDesign:
     efforts, grams : ndarray, shape (blocks + 1, n, n)
         Gram matrices of `basis` and `filtered` before every `BLOCK`th sample, and of all.
     spectral_radius, condition : float
-        rho(F) and cond(R): the acceptance figures.
+        rho(F) and cond(R), the acceptance criteria.
 
     Raises
     ------
     DesignError
-        When rho(F) > 0.9 or cond(R) > 1e10.
+        If rho(F) > 0.9 or cond(R) > 1e10.
     """
 
     def __init__(
@@ -145,7 +145,7 @@ class PreviewDesign:
 
 
 def _nodes(rows: Array) -> tuple[NDArray[np.int64], Array]:
-    """Return few rows that span a matrix, and by how much each row takes of them.
+    """Return a few rows that span a matrix, and the coefficients of all rows in them.
 
     Source: the interpolative decomposition by pivoted QR of H. Cheng, Z. Gimbutas, P. G.
     Martinsson and V. Rokhlin, SIAM J. Sci. Comput. 26 (2005).

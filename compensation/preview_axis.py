@@ -48,7 +48,7 @@ Ints = NDArray[np.int64]
 class Rung:
     """One step of the ladder: number of functions (per 300 samples) and price of acceleration.
 
-    Both count samples of 1 ms: at another sampling the same ladder is another design.
+    Both refer to samples of 1 ms: at another sampling time the same ladder is another design.
     """
 
     n: int
@@ -61,19 +61,19 @@ LADDER = (
 )
 """Designs from the most accurate to the gentlest."""
 GENTLE_RUNG = 3
-"""Last rung with all functions: those below it pay for smoothness with accuracy."""
+"""Last rung with all functions: gentler ones trade accuracy for smoothness."""
 BAND_MARGIN = 1.2
-"""A command may reach this many times as high as its model's band. Prices make the cut-off gradual:
-little is left beyond the band, while ending right at it would cost accuracy within."""
+"""Ratio of a command's bandwidth to its model's band. The price makes the cut-off gradual: little
+is left beyond the band, while a cut-off right at its edge would cost accuracy within it."""
 
 REST_FUNCTIONS = 64
-"""Most functions (per 300 samples) in windows that hold a rest, which are solved one by one."""
+"""Most functions (per 300 samples) in windows with a rest, which are solved individually."""
 ROBUST_CHOICE = 1.1
-"""The robust basis chooses n functions out of this many times n."""
+"""The robust basis selects n of this many times n functions."""
 WEIGHT_TRAVEL = 0.2
 WEIGHT_REST = 0.5
-"""Ringing during a rest happens above the end of a line. A smaller weight leaves more of it without
-any gain while extruding; from 1 on, accuracy while extruding suffers."""
+"""Ringing during a rest is above the end of a line. A smaller weight allows more of it without any
+gain while extruding; from 1 on, accuracy while extruding suffers."""
 _FORGOTTEN = 1e-12
 """A vibration that has decayed to this share is dropped from the state."""
 _NESTED = {"ce-opt", "dct"}
@@ -82,20 +82,20 @@ _NESTED = {"ce-opt", "dct"}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AxisTask:
-    """What an axis shall do in one piece.
+    """The command problem of an axis for one piece.
 
     Attributes
     ----------
     path_mm : ndarray, shape (n,)
         Planned positions; the command starts and ends on them.
     weight : ndarray, shape (n,)
-        Weight of the errors in windows that hold a rest.
+        Weight of the errors in windows with a rest.
     stops : ndarray of int64, shape (k, 2)
-        Ranges [a, b) of samples in which the command stands, those before and after the piece
-        included.
+        Ranges [a, b) of samples in which the command stands, including those before and after the
+        piece.
     bounds : Bounds
     rms_limit_mm_s2 : float
-        Rms acceleration of the command that is still smooth.
+        Largest rms acceleration of a command that counts as smooth.
     """
 
     path_mm: Array
@@ -107,13 +107,13 @@ class AxisTask:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AxisCommand:
-    """Command of an axis for one piece, and the state in which it leaves the plants.
+    """Command of an axis for one piece, and the final states of the plants.
 
     Attributes
     ----------
     position_mm : ndarray, shape (n,)
     states : ndarray
-        Of all members, relative to the last position.
+        States of all members, relative to the last position.
     """
 
     position_mm: Array
@@ -122,21 +122,21 @@ class AxisCommand:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Drive:
-    """What a rung makes of a piece before the plants' states are known.
+    """The part of a piece's command that does not depend on the plants' states.
 
     Attributes
     ----------
     task : AxisTask
     rung : int
     path_mm, weight : ndarray, shape (windows * update + window,)
-        Of the task, relative to where the path begins, and beyond its end.
+        Those of the task, relative to the start of the path, extended beyond its end.
     targets_mm : ndarray, shape (components, windows * update + window)
     command : ndarray, shape (windows, update)
         S y_d of every window.
     state : ndarray, shape (windows, nz)
         H y_d.
     memory : Memory
-        Windows solved one by one.
+        Windows solved individually.
     """
 
     task: AxisTask
@@ -156,10 +156,9 @@ class Designs:
     ----------
     lifted : LiftedWindow
     ladder : tuple of Rung
-        `LADDER` with at most so many functions as the model's band allows; rungs that become the
-        same are one.
+        `LADDER` with at most as many functions as the model's band allows; equal rungs are merged.
     at_rests : Condensed
-        The part of `lifted` that windows with rests are solved for.
+        Reduced form of `lifted` for windows with rests.
     """
 
     def __init__(self, lifted: LiftedWindow, basis: str, most: int = 300) -> None:
@@ -191,7 +190,7 @@ class Designs:
         return self._made[n, step.price]
 
     def check(self) -> None:
-        """Raise the DesignError of the first rung if every rung refuses itself."""
+        """Raise the DesignError of the first rung if all rungs fail."""
         refusals = []
         for rung in range(len(self.ladder)):
             try:
@@ -209,13 +208,13 @@ class Designs:
         return self._functions[size]
 
     def _made_for(self, n: int) -> Array:
-        # Members that are alike leave nothing to choose.
+        # With equal members all functions are equally robust.
         if self._basis == "robust" and len(self.lifted.integrated) == 1:
             return ce_opt_basis(self._set.gram, n)
         if self._basis != "robust":
             return BASES[self._basis](self._set, n)
-        # Far above its modes a set agrees too, on hardly answering: choose among the directions
-        # that are answered best (4.10).
+        # Far above its modes a set also agrees, as it hardly responds: choose among the directions
+        # of largest gain (4.10).
         window = self.lifted.window
         kept = min(window, round(ROBUST_CHOICE * n))
         return robust_basis(self._set.gram, self._set.mean, n, window - kept)
@@ -233,12 +232,12 @@ def designs(
     basis: str,
     most: int = 300,
 ) -> Designs:
-    """Designs of an axis; those used last are kept (up to 30 MB each, for sets)."""
+    """Return the designs of an axis, cached by recent use (up to 30 MB each for sets)."""
     return Designs(lifted_window(plants, weights, window, update), basis, most)
 
 
 def functions_within(band_hz: tuple[float, float] | None, dt_s: float) -> int:
-    """Most functions per 300 samples with which a command stays within the band of its model.
+    """Return the most functions per 300 samples that keep a command within its model's band.
 
     n functions over a window T span frequencies up to n / (2 T).
     """
@@ -251,11 +250,11 @@ class PreviewAxis:
     Attributes
     ----------
     rung, next_rung : int
-        Where the ladder starts for this piece, and for the next one once this is committed.
+        Rung at which this piece starts, and the next one once this is committed.
     last_rung : int
         The gentlest design.
     members : int
-        Plants that the designs look at.
+        Number of plants in the designs.
     """
 
     def __init__(self, name: str, designs: Designs) -> None:
@@ -272,12 +271,12 @@ class PreviewAxis:
 
     def reset(self, position: float) -> None:
         """Assume that the axis stands still at `position`."""
-        # States are kept relative to `origin`: the digits belong to the vibration.
+        # States are relative to `origin`, so that the vibration keeps full precision.
         self._origin = position
         self._states = np.zeros(sum(p.order for p in self._plants))
 
     def observe(self, command: Array) -> None:
-        """Let the axis follow a command (n,) made elsewhere, up to the sample after its last."""
+        """Account for a command (n,) made elsewhere, up to the sample after its last."""
         if len(command) == 0:
             return
         origin = float(command[-1])
@@ -289,19 +288,19 @@ class PreviewAxis:
         self._states = self._advanced(states, recent)
 
     def commit(self, command: AxisCommand) -> None:
-        """Take a command as executed."""
+        """Mark a command as executed."""
         self._origin, self._states = float(command.position_mm[-1]), command.states
         self.rung = self.next_rung
         self._made = None
 
     def commit_as(self, command: Array) -> None:
-        """Take a command (n,) as executed that was made of the last one."""
+        """Mark a command (n,) derived from the last one as executed."""
         self.observe(command)
         self.rung = self.next_rung
         self._made = None
 
     def answer(self, member: int, command: Array) -> Array:
-        """Return the positions (n,) with which a member of the set answers a command (n,)."""
+        """Return the response (n,) of a member of the set to a command (n,)."""
         first = sum(p.order for p in self._plants[:member])
         p = self._plants[member]
         self._move_origin(float(command[0]))
@@ -310,7 +309,7 @@ class PreviewAxis:
         return y
 
     def windows_outside(self, bounds: Bounds, command: Array) -> set[int]:
-        """Return the windows in which a command (n,) leaves the bounds, and those before them."""
+        """Return the windows in which a command (n,) exceeds the bounds, and those before them."""
         bend, step = _changes(command)
         slack = 1.0 + 1e-9
         outside = command < bounds.low_mm - TRAVEL_SLACK_MM
@@ -323,7 +322,7 @@ class PreviewAxis:
     def command(
         self, rung: int, task: AxisTask, careful: Set[int], targets_mm: Array | None = None
     ) -> AxisCommand:
-        """Command of a piece; windows with rests and `careful` ones are solved one by one.
+        """Return the command of a piece; windows with rests and `careful` ones are solved singly.
 
         Parameters
         ----------
@@ -333,12 +332,12 @@ class PreviewAxis:
         careful : set of int
             Windows in which the bounds are kept.
         targets_mm : ndarray, shape (members, n), optional
-            What each member shall do; by default the path.
+            Desired motion of each member; by default the path.
         """
         drive = self._drive(rung, task, targets_mm)
         self._move_origin(float(task.path_mm[0]))
         u, last_states = self._solved(rung, task, careful, drive)
-        # The windows run on past the end of the path, where the command stands.
+        # The windows continue past the end of the path, where the command stands.
         n, origin, end_mm = len(task.path_mm), self._origin, float(task.path_mm[-1])
         u[n - 1] = end_mm - origin
         states = self._advanced(last_states, u[len(u) - self.update : n - 1])
@@ -394,7 +393,7 @@ class PreviewAxis:
                     )
                 if w == until:
                     break
-                # It needs its bounds.
+                # This window needs its bounds.
                 start = w * update
                 path_mm = drive.path_mm[start : start + window]
                 used = rest_functions if len(tied.moving) > 1 else functions
@@ -409,8 +408,8 @@ class PreviewAxis:
     def _drive(self, rung: int, task: AxisTask, targets_mm: Array | None) -> _Drive:
         """Return the command of a rung for a piece; the last result is reused if both are the same.
 
-        A piece is often asked for again with a few more windows within bounds. Windows that begin
-        as they did before are then not solved again.
+        A piece is often requested again with a few more windows within bounds. Windows with the
+        same initial state are then not solved again.
         """
         made = self._made
         if made is not None and targets_mm is None and made.task is task and made.rung == rung:
@@ -437,7 +436,7 @@ class PreviewAxis:
             np.zeros(len(command), bool), np.empty(state.shape), np.empty(command.shape)
         )
         made = _Drive(task, rung, padded, weight, targets, command, state, memory)
-        # Targets of the members' own come in an array that changes.
+        # Separate targets are passed in an array that changes: do not cache them.
         self._made = made if targets_mm is None else None
         return made
 
@@ -458,15 +457,15 @@ class PreviewAxis:
 
 
 def _changes(command: Array) -> tuple[Array, Array]:
-    """Second and first differences at every sample; the command starts and ends standing."""
+    """Return second and first differences at every sample, with standstill at both ends."""
     standing = np.concatenate([command[:1], command, command[-1:]])
     return np.diff(standing, 2), np.diff(standing)[:-1]
 
 
 def _products(samples: Array, gain: Array, update: int) -> Array:
-    """Products of a gain, (k, window), with all windows, one row each.
+    """Return the products of a gain, (k, window), with all windows, one row each.
 
-    Windows overlap; so the gain is taken apart, and no sample has to be copied.
+    The gain is split into blocks, so that overlapping windows need not be copied.
     """
     window = gain.shape[1]
     windows = (len(samples) - window) // update

@@ -1,6 +1,6 @@
 """The list of compensators by name.
 
-Each is imported when it is asked for: together they load a second's worth of libraries.
+Each is imported on demand: importing all takes about a second.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ _RIPPLE = "+ripple"
 def compensator(name: str, machine: Machine, dt_s: float, **settings: Any) -> Compensator:
     """Make the compensator `name` for a machine, at the sampling time `dt_s`.
 
-    ``NAME+ripple``, and ``none+ripple``, undo the machine's ripple as well (`compensation.ripple`).
-    Of ``fbf`` dry friction is made up for, where a machine has any (`compensation.friction`).
-    For a machine with schedules it follows the plants (`compensation.scheduled`).
+    ``NAME+ripple`` and ``none+ripple`` compensate the machine's ripple too (`compensation.ripple`).
+    With ``fbf``, dry friction is compensated if the machine has any (`compensation.friction`). For
+    a machine with schedules the compensator follows the plants (`compensation.scheduled`).
 
     Raises
     ------

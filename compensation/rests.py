@@ -1,8 +1,8 @@
-"""Making a filtered command stand still where the machine must not move.
+"""Make a filtered command stand still where the machine must not move.
 
-A filter spreads every motion over its length; a rest (retraction, Z hop) cuts that off. Before
-the rest the command is led onto the plan, after it from there back to the filter's output, by the
-cubic in their difference that matches position and speed at both of its ends.
+A filter spreads every motion over its length, but a rest (retraction, Z hop) allows none. The
+command is blended onto the plan before the rest and back to the filter's output after it, by the
+cubic in their difference that matches position and speed at both ends.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ def stand_still(u_mm: Array, y_d_mm: Array, rests: NDArray[np.int64], blend: int
     u_mm, y_d_mm : ndarray, shape (2, n)
         Filter output and plan; the plan stands still in the rests.
     rests : ndarray of int64, shape (k, 2)
-        Sample ranges [a, b); the sample before `a` belongs to the rest too: the plan stands there
-        already. After it a rest shorter than a sample may be over.
+        Sample ranges [a, b). The sample before `a` also belongs to the rest, as the plan already
+        stands there; a rest shorter than a sample may be over right after it.
     blend : int
         Samples of a transition; at most half the distance to the next rest.
     """
@@ -36,7 +36,7 @@ def stand_still(u_mm: Array, y_d_mm: Array, rests: NDArray[np.int64], blend: int
         return out
     still = [(max(int(a) - 1, 0), min(int(b), n)) for a, b in rests if b > a]
     spans = _joined([(0, 1), *still, (n - 1, n)])
-    # Every correction is worked out from the filter's output, so none sees another.
+    # Every correction is computed from the filter's output, independently of the others.
     for (_, begin), (end, _) in pairwise(spans):
         gap = end - begin
         length = min(blend, max(gap // 2, 1))
@@ -48,7 +48,7 @@ def stand_still(u_mm: Array, y_d_mm: Array, rests: NDArray[np.int64], blend: int
 
 
 def _joined(spans: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Merge spans that overlap; between two that only touch, the plan may have moved."""
+    """Merge overlapping spans, but not touching ones: the plan may move between these."""
     joined: list[tuple[int, int]] = []
     for a, b in sorted(spans):
         if joined and a < joined[-1][1]:
@@ -59,7 +59,7 @@ def _joined(spans: list[tuple[int, int]]) -> list[tuple[int, int]]:
 
 
 def _lead(part: Array, u: Array, y_d: Array, rest: int, step: int) -> None:
-    """Subtract from `part` (view of the command, away from the rest) the fading deviation.
+    """Subtract the fading deviation from `part`, a view of the command next to a rest.
 
     `rest` is the sample at the edge of the rest, `step` the direction away from it.
     """

@@ -1,15 +1,15 @@
-"""Compensation of ripple: a table over position, laid over any other compensator.
+"""Compensation of ripple by a table over position, on top of any other compensator.
 
-Where ripple enters decides what undoes it (reference: repetitive compensation of print files):
+The correction depends on where ripple enters (reference: repetitive compensation of print files):
 
 ``input``
-    y = G (u + delta(u)). With r what the other compensator wants the machine to receive, the
-    command u solves u + delta(u) = r: no plant, any speed.
+    y = G (u + delta(u)). With r the command of the other compensator, u solves u + delta(u) = r,
+    at any speed and without a plant.
 ``output``
-    y = G u + d(s(t)). The command is r - G^-1 d along the planned path; it needs the plant.
+    y = G u + d(s(t)). The command is r - G^-1 d along the planned path, which needs the plant.
 
-A wave of wavenumber k is a vibration of k v / 2 pi Hz at the speed v. Its share fades, without
-phase, where its own acceleration would exceed a budget, and towards the Nyquist frequency: on fast
+A wave of wavenumber k is a vibration of k v / 2 pi Hz at the speed v. Its correction fades out with
+zero phase where its acceleration would exceed a budget, and towards the Nyquist frequency: on fast
 travel the machine cannot follow, and nothing is printed. The budget is the largest of a ladder
 whose command keeps the machine's limits.
 """
@@ -42,7 +42,7 @@ __all__ = [
 Array = NDArray[np.float64]
 
 _STEPS = (1.0, 0.5, 0.25, 0.125, 0.0625, 0.03125)
-"""Acceleration that a wave may take, as shares of the machine's limit, tried in turn."""
+"""Acceleration allowed to a wave, as shares of the machine's limit, tried in turn."""
 _BAND = (0.30, 0.45)
 """A wave fades out between these frequencies (times the sampling time)."""
 _CUTOFF = 0.2
@@ -50,24 +50,24 @@ _CUTOFF = 0.2
 _BLEND_S = 0.02
 _MOST_STEPS, _CLOSE_MM = 20, 1e-12
 _SLOWEST_ZERO = 0.97
-"""Zeros of the plant nearer the unit circle are not cancelled: their inverse rings."""
+"""Zeros of the plant beyond this radius are not cancelled: their inverse rings."""
 _EXTRA_TERMS = 3
 
 
 def input_command(wanted_mm: Array, table: RippleTable, share: Array | None = None) -> Array:
-    """Return u with u + delta(u) = wanted, sample by sample: equal inputs, equal outputs.
+    """Return u with u + delta(u) = wanted, sample by sample.
 
     Parameters
     ----------
     wanted_mm : ndarray, shape (n,)
     table : RippleTable
     share : ndarray, shape (len(table), n), optional
-        Of every wave; see `wave_shares`.
+        Share of every wave; see `wave_shares`.
 
     Raises
     ------
     DesignError
-        If the ripple is so steep that no command undoes it.
+        If the ripple is too steep for any command to cancel it.
     """
     if table.steepest >= 1.0:
         raise DesignError(
@@ -92,8 +92,8 @@ def output_command(
 ) -> Array:
     """Return -G^-1 d(s) along a path, shape (n,); see `input_command`.
 
-    At corners of the path the speed steps, and -G^-1 would answer with a blow: `fir`, symmetric of
-    odd length, takes out what lies above the waves.
+    Speed steps at corners of the path would make -G^-1 respond with a spike: `fir`, symmetric of
+    odd length, removes what lies above the waves.
     """
     return -inverse.apply(table.deviation_mm(path_mm, share), fir)
 
@@ -107,16 +107,16 @@ def wave_shares(
 ) -> Array:
     """Return the share of every wave at every sample, shape (len(table), n).
 
-    1 at rest; a little more where the straight lines between samples would take some off.
+    1 at rest; slightly more where linear interpolation between samples attenuates the wave.
 
     Parameters
     ----------
     path_mm : ndarray, shape (n,)
-        What the axis does; its speed makes the waves' frequencies.
+        Motion of the axis; its speed determines the waves' frequencies.
     budget_mm_s2 : float
-        Largest amplitude of the acceleration that undoes one wave.
+        Largest acceleration amplitude of the correction of one wave.
     plant : DiscretePlant, optional
-        What has to be inverted to undo it (output side).
+        Plant to be inverted (output side).
     """
     speed = np.abs(np.gradient(path_mm)) / dt_s if len(path_mm) > 1 else np.zeros(len(path_mm))
     shares = np.empty((len(table), len(path_mm)))
@@ -129,8 +129,8 @@ def wave_shares(
         if plant is not None:
             effort /= _gain(plant, f_hz)
         else:
-            # Between samples the command is linear, which takes sinc^2 off a wave; an inverse of
-            # the plant knows that already.
+            # Linear interpolation between samples attenuates a wave by sinc^2; an inverse of the
+            # plant already includes that.
             shares[k] /= np.sinc(np.minimum(f_hz * dt_s, 0.5)) ** 2
         shares[k] *= np.minimum(1.0, budget_mm_s2 / np.maximum(effort, 1e-12))
     return shares
@@ -159,15 +159,15 @@ class _Output:
 
 
 class RippleCompensator(Overlay):
-    """Undo the ripple of a machine under another compensator.
+    """Compensate the ripple of a machine on top of another compensator.
 
-    In rests, and at the ends of a piece, the command stands on the plan; `_BLEND_S` before and
-    after, the table fades in and out.
+    In rests, and at the ends of a piece, the command stands on the plan; the correction fades out
+    and in within `_BLEND_S` before and after.
 
     Parameters
     ----------
     inner : Compensator
-        What undoes the vibration: its command is what the axes shall receive.
+        Compensates vibration: its command is what the axes should receive.
     machine : Machine
         With its ripple.
     dt_s : float
@@ -175,8 +175,8 @@ class RippleCompensator(Overlay):
     Raises
     ------
     DesignError
-        If there is nothing to undo, homing is so uncertain that the table would do harm, or a
-        plant has no inverse.
+        If there is no ripple, homing is so uncertain that the table would do harm, or a plant has
+        no inverse.
     """
 
     def __init__(self, inner: Compensator, machine: Machine, dt_s: float) -> None:
@@ -191,7 +191,7 @@ class RippleCompensator(Overlay):
         ]
         self._blend = max(2, round(_BLEND_S / dt_s))
         self._least_mm_s2 = self.budget_mm_s2 = machine.command.accel_mm_s2
-        """Budget for a wave's acceleration in the last piece; 0: no room, the ripple stays."""
+        """Budget for a wave's acceleration in the last piece; 0: the ripple was not compensated."""
 
     def compensate(
         self, y_d_mm: Array, extruding: NDArray[np.bool_], rests: NDArray[np.int64]
@@ -252,11 +252,11 @@ def _inverted(axis: str, plant: DiscretePlant, table: RippleTable) -> _Output:
 
 
 def _lowpass(cutoff: float) -> Array:
-    """Zero-phase low-pass, flat up to 0.8 of its cutoff (in units of the sampling rate)."""
+    """Return a zero-phase low-pass, flat up to 0.8 of its cutoff (in sampling rates)."""
     return np.asarray(firwin(2 * math.ceil(4.0 / cutoff) + 1, 2.0 * cutoff))
 
 
 def _gain(plant: DiscretePlant, f_hz: Array) -> Array:
-    """|G| at many frequencies, interpolated from a grid."""
+    """Return |G| at many frequencies, interpolated from a grid."""
     grid = np.linspace(0.0, 0.5 / plant.dt_s, 513)
     return np.interp(f_hz, grid, np.maximum(np.abs(plant.frequency_response(grid)), 1e-6))

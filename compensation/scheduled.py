@@ -1,10 +1,10 @@
-"""A compensator for a machine whose plants change during the print: one for every operating point.
+"""Compensation of a machine whose plants change during the print, by operating point.
 
 Mass and height change between pieces, which begin and end at rest. The compensator of the new point
-then takes over the motion of the last seconds, so that it knows how the machine still vibrates;
-commands begin and end on the path, so that nothing steps. Plants that depend on x and y are blended
-within a piece: u = sum_i w_i(y_d) u_i, with weights of the planned position that add up to 1. Where
-the plan stands they stand too, and every u_i stands on the plan.
+then replays the motion of the last seconds, so that it knows the present vibration; commands begin
+and end on the path, so there are no steps. Plants that depend on x and y are blended within a
+piece: u = sum_i w_i(y_d) u_i, with weights of the planned position that sum to 1. Where the plan
+stands, the weights are constant, and every u_i stands on the plan.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ Array = NDArray[np.float64]
 DESIGN_STEP = 0.02
 """Relative change of a resonance between neighbouring designs in mass and height."""
 BLEND_STEP = 0.02
-"""The same in x and y, where neighbours are blended: the error is the square of the difference."""
+"""The same in x and y, where blending leaves an error of the square of the difference."""
 REMEMBERED_S = 4.0
-"""Length of the past that a compensator is run through before it takes over."""
+"""Length of the past motion replayed by a compensator before it takes over."""
 _ROOM = 0.98
-"""Share of the limits for each design: blends of designs exceed the limits of either a little."""
+"""Share of the limits for each design, as a blend slightly exceeds those of its parts."""
 
 
 class ScheduledCompensator:
@@ -41,7 +41,7 @@ class ScheduledCompensator:
     machine : Machine
         With schedules.
     make : callable
-        From a machine without schedules to its compensator.
+        Makes the compensator of a machine without schedules.
     dt_s : float
 
     Attributes
@@ -52,7 +52,7 @@ class ScheduledCompensator:
     Raises
     ------
     DesignError
-        Where the empty machine's compensator cannot be designed.
+        If the compensator of the empty machine cannot be designed.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class ScheduledCompensator:
         self._made: dict[OperatingPoint, Compensator] = {}
         self._share = 1.0
         self._knowing: set[OperatingPoint] = set()
-        """Points whose compensators have followed the machine's state so far."""
+        """Points whose compensators know the present state of the machine."""
         self._past = np.zeros((2, 1))
         self._last: Array | None = None
         self._used: tuple[OperatingPoint, ...] = ()
@@ -81,36 +81,36 @@ class ScheduledCompensator:
             self._made[point].reset(position_mm)
 
     def observe(self, command_mm: Array) -> None:
-        """Let the machine follow a command (2, n) that was not ours."""
+        """Account for a command (2, n) that did not come from `compensate`."""
         self._remember(command_mm)
         for point in self._knowing:
             self._made[point].observe(command_mm)
 
     def commit(self) -> None:
-        """Take the last command as executed."""
+        """Mark the last command as executed."""
         if self._last is None:
             return
         # The last sample of a piece is the first one of what follows.
         self._remember(self._last[:, :-1])
         for point in self._used:
             self._made[point].commit()
-        # A blend is no command of any of its parts.
+        # A blended command is not that of any single compensator.
         self._knowing = set(self._used) if len(self._used) == 1 else set()
 
     def operate_at(self, point: OperatingPoint) -> None:
-        """Take the designs for this point; the machine stands still.
+        """Switch to the designs for this point; the machine stands still.
 
         Raises
         ------
         DesignError
-            Where there is none.
+            If there is none.
         """
         level = self._grid.level(point)
         if level == self._level:
             return
         left, self._level = self._points, level
         self._points = self._grid.at_level(level)
-        # A print wanders about a level before it leaves it for good.
+        # A print alternates between levels before it finally leaves one.
         kept = {*left, *self._points}
         self._made = {p: c for p, c in self._made.items() if p in kept}
         self._knowing &= set(self._points)
@@ -136,7 +136,7 @@ class ScheduledCompensator:
         Raises
         ------
         DesignError
-            Also where a blend leaves the machine's limits.
+            Also if a blend exceeds the machine's limits.
         """
         weights = self._grid.weights(y_d_mm)
         shares = {p: w for p, w in zip(self._points, weights, strict=True) if np.any(w)}
@@ -145,7 +145,7 @@ class ScheduledCompensator:
         if len(commands) == 1:
             self._last = commands[self._used[0]]
         else:
-            # From the path: where all commands stand on it, so does the blend, to the last digit.
+            # Relative to the path: where all commands are on it, the blend is exactly too.
             self._last = y_d_mm + sum(w * (commands[p] - y_d_mm) for p, w in shares.items())
             self._check(self._last, y_d_mm)
         return self._last
@@ -162,7 +162,7 @@ class ScheduledCompensator:
         return self._made[point]
 
     def _with_past(self, point: OperatingPoint) -> Compensator:
-        """Return a compensator that knows how the machine vibrates."""
+        """Return a compensator that knows the present vibration."""
         one = self._compensator(point)
         if point not in self._knowing:
             one.reset(self._past[:, 0])
@@ -175,7 +175,7 @@ class ScheduledCompensator:
         self._past = past[:, -self._remembered :].copy()
 
     def _check(self, command: Array, y_d_mm: Array) -> None:
-        """Raise unless the blend keeps the limits, or the path itself is beyond them."""
+        """Raise unless the blend keeps the limits, or the path itself exceeds them."""
         dt, machine = self._dt_s, self._machine
         axes = [machine.command.of("x"), machine.command.of("y")]
         for what, limits, order in (

@@ -1,4 +1,4 @@
-"""Input shapers as the firmware defines them: the reference shaper, and compensators of their own.
+"""Input shapers as the firmware defines them, as a reference and as compensators.
 
 A shaper replaces the command by a weighted sum of delayed copies of itself; the weights and
 delays make the vibrations of the copies cancel.
@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 
 
 def shaper_pulses(name: str, f_hz: float, zeta: float = 0.1) -> Pulses:
-    """Return `models.shaper_pulses.shaper_pulses`; a bad shaper is a DesignError here."""
+    """Return `models.shaper_pulses.shaper_pulses`; raise DesignError for a bad shaper."""
     try:
         return firmware.shaper_pulses(name, f_hz, zeta)
     except ModelError as error:
@@ -50,9 +50,9 @@ def shape(
     pulses : (weights, delays_s)
         As `shaper_pulses` returns them.
     centred : bool
-        Start earlier by the mean delay (as Klipper does), so that slow motion is not delayed.
+        Advance by the mean delay (as Klipper does), so that slow motion is not delayed.
     out : ndarray, shape (..., n), optional
-        Where the shaped command is written to, if not to a new array; contiguous.
+        Contiguous output array; default: a new one.
 
     Returns
     -------
@@ -64,7 +64,7 @@ def shape(
     late = (delays - shift) / dt_s
     whole = np.floor(late)
     part = late - whole
-    # What falls between two samples is shared by them.
+    # A pulse between two samples is split between them.
     samples = np.stack([whole, whole + 1.0], axis=1).astype(np.int64).ravel()
     gains = (weights[:, None] * np.stack([1.0 - part, part], axis=1)).ravel()
     used = gains != 0.0
@@ -78,7 +78,7 @@ def shape(
 
 
 def shape_xy(command_mm: Array, dt_s: float, pulses: Sequence[Pulses]) -> Array:
-    """Apply to X and Y, shape (2, n), the shaper of each; see `shape`."""
+    """Apply the shapers of X and Y to a command (2, n); see `shape`."""
     return np.stack([shape(row, dt_s, own) for row, own in zip(command_mm, pulses, strict=True)])
 
 

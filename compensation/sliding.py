@@ -1,12 +1,12 @@
-"""Targets that slide along the path, and the weights of a set that go with them.
+"""Targets that slide along the path, and matching weights of a plant set.
 
-A print asks of every member of a plant set only that it be ON the path, not when. Each member
-therefore gets a target of its own: the point of the path nearest to what it does anyway, and from
-there a small way back towards its time. The error across the path then counts in full and the
-error along it with a small weight. Moving the targets (the exact minimum over the slack along the
-path) and filtering them (the exact minimum over the command) in turn is the majorise-minimise
-iteration for that weighted sum. Gains stay constant all the while; X and Y meet in the nearest
-point alone, and corners need no special case.
+For a print, every member of a plant set must be ON the path, but not at an exact time. Each member
+therefore gets its own target: the point of the path nearest to its response, moved slightly back
+towards the planned time. The error across the path then counts in full and the error along it with
+a small weight. Alternately moving the targets (the exact minimum over the slack along the path) and
+filtering them (the exact minimum over the command) is the majorise-minimise iteration for that
+weighted sum. The gains stay constant; X and Y are coupled only through the nearest point, and
+corners need no special case.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ Choice = tuple[int, frozenset[int]]
 
 ROUNDS = 4
 RELAXATION = 1.6
-"""Over-relaxation towards the new targets; 2 would be the edge of stability."""
+"""Over-relaxation towards the new targets; 2 would be the stability limit."""
 REACH_S = 0.008
 _BOUNDED_ROUNDS = 12
 _WEIGHT_ROUNDS = 8
@@ -61,9 +61,9 @@ def slide(
     ----------
     axes : PreviewAxis of X and of Y
     commands, tasks : of the axes
-        The commands for the path itself, and what the axes shall do.
+        The commands for the path itself, and the axes' tasks.
     chosen : of the axes
-        Rung of the ladder, and windows that are solved within bounds.
+        Rung of the ladder, and windows solved within bounds.
     extruding : ndarray of bool, shape (n,)
     along : float
         Weight of the error along the path against that across it.
@@ -72,7 +72,7 @@ def slide(
     Returns
     -------
     list of AxisCommand
-        Within the bounds; those of the last round that keeps them.
+        From the last round that keeps the bounds.
     """
     path = np.stack([task.path_mm for task in tasks])
     members = max(axis.members for axis in axes)
@@ -99,7 +99,7 @@ def slide(
 def _within_bounds(
     axis: PreviewAxis, task: AxisTask, choice: Choice, targets_mm: Array
 ) -> tuple[AxisCommand | None, Choice]:
-    """Command for targets of the members' own, on the same rung or a gentler one."""
+    """Return the command for the members' targets, on the same rung or a gentler one."""
     rung, careful = choice
     for _ in range(_BOUNDED_ROUNDS):
         command = axis.command(rung, task, careful, targets_mm)
@@ -123,7 +123,7 @@ def balanced_weights(
     basis: str,
     along: float,
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Weights of the members under which their contour errors e_j are more alike.
+    """Return weights of the members that make their contour errors e_j more equal.
 
     They minimise sum_j p_j e_j^4 on the reference motion, p_j the given weights: a fixed point of
     l_j ~ p_j e_j^2. Least squares alone minimises sum_j p_j e_j^2, a true minimax the largest e_j
@@ -161,7 +161,7 @@ def balanced_weights(
         )
         for i, prior in enumerate(given):
             wanted = prior * squares
-            # Half the way in the exponent: the errors answer the weights.
+            # Geometric mean of old and new weights, as the errors depend on the weights.
             moved = np.sqrt(found[i] * wanted / wanted.sum())
             moved = np.maximum(moved / moved.sum(), _LEAST_SHARE * prior)
             found[i] = moved / moved.sum()
@@ -169,7 +169,7 @@ def balanced_weights(
 
 
 def _answer(axes: Sequence[PreviewAxis], commands: Sequence[AxisCommand], j: int) -> Array:
-    """Return what member j does; j of X goes with j of Y, an axis with fewer begins again."""
+    """Return the response of member j of X and of Y; the shorter list repeats."""
     pairs = zip(axes, commands, strict=True)
     return np.stack([axis.answer(j % axis.members, u.position_mm) for axis, u in pairs])
 

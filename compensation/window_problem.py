@@ -1,13 +1,13 @@
-"""The optimisation problem of a single window: with rests, and within bounds.
+"""The optimisation problem of a single window with rests and within bounds.
 
-Over a rest [a, b) only E or Z moves and X and Y must stand still. The increments are tied down
-there: the one at a stops the command, the others are zero, and the remaining functions are solved
-for by weighted least squares with a small price on acceleration, under the constraint that the
-command stands exactly on the path. The weight is low inside the rest (nothing is printed) and back
-to normal after it, otherwise the command would wander off (docs/method.md).
+During a rest [a, b) only E or Z moves and X and Y must stand still. The increments are fixed there:
+the one at a stops the command, the others are zero, and the remaining ones are found by weighted
+least squares with a small penalty on acceleration, under the constraint that the command stands
+exactly on the path. The weight is low inside the rest (nothing is printed) and normal after it,
+otherwise the command would drift away (docs/method.md).
 
-Where the solution would leave the machine's bounds, the same problem is solved as a quadratic
-programme (DAQP, a dual active-set method).
+If the solution exceeds the machine's bounds, the same problem is solved as a quadratic programme
+(DAQP, a dual active-set method).
 """
 
 from __future__ import annotations
@@ -47,18 +47,18 @@ __all__ = [
 Array = NDArray[np.float64]
 
 EFFORT_PRICE = 0.5
-"""Price of squared increments (mm/sample^2)^2 against squared error mm^2 at rests."""
+"""Weight of squared increments (mm/sample^2)^2 relative to squared error mm^2 at rests."""
 TRAVEL_SLACK_MM = 1e-6
 _TRAVEL_SCALE_MM = 0.1
 _MARGIN = 1e-5
 """The solver keeps bounds to 1e-6 of their scale."""
 _EQUAL = 5
-"""DAQP's mark of an equality."""
+"""DAQP's flag for an equality."""
 
 
 @dataclass(frozen=True, slots=True)
 class Bounds:
-    """What the command of an axis must keep, in mm and samples.
+    """Bounds of the command of an axis, in mm and samples.
 
     Attributes
     ----------
@@ -88,13 +88,13 @@ class Bounds:
         )
 
     def limits(self) -> Array:
-        """Return what extremes may reach, with room for rounding: accel, speed, low, high."""
+        """Return the limits with a tolerance for rounding: accel, speed, low, high."""
         room = 1.0 + 1e-9
         travel = self.low_mm - TRAVEL_SLACK_MM, self.high_mm + TRAVEL_SLACK_MM
         return np.array([room * self.accel, room * self.speed, *travel])
 
     def kept(self, reached: Extremes) -> bool:
-        """Whether acceleration, speed and travel are kept."""
+        """Return whether acceleration, speed and travel are within the bounds."""
         accel, speed, low, high = self.limits()
         return bool(
             reached.accel <= accel
@@ -105,7 +105,7 @@ class Bounds:
 
 
 class Extremes(NamedTuple):
-    """What a command asks for, in mm and samples: see `Bounds`; and its mean squared increment."""
+    """Extremes of a command in mm and samples (see `Bounds`), and its mean squared increment."""
 
     accel: float
     speed: float
@@ -115,7 +115,7 @@ class Extremes(NamedTuple):
 
     @classmethod
     def of(cls, command: Array, last: float, previous: float, *, stops: bool = False) -> Extremes:
-        """Look at a command that follows two others, and whether it stops after its end."""
+        """Measure a command that follows two samples and, with `stops`, stops after its end."""
         return cls(*extremes(command, last, previous, stops))
 
 
@@ -128,7 +128,7 @@ def solve_window(
     rests: NDArray[np.int64],
     bounds: Bounds,
 ) -> Array:
-    """Command of one window that stands still over the given rests.
+    """Return the command of one window that stands still in the given rests.
 
     Parameters
     ----------
@@ -139,13 +139,13 @@ def solve_window(
     path_mm : ndarray, shape (window,)
         Planned positions, on which the command stands in the rests.
     targets_mm : ndarray, shape (components, window)
-        What each component of the set shall do: `lifted.target` times the path, or nearly.
+        Target of each component of the set: `lifted.target` times the path, or close to it.
     weight : ndarray, shape (window,)
         Weight of the errors.
     rests : ndarray of int64, shape (k, 2)
         Ranges [a, b) of samples, relative to the window, in which u(i) = u(i - 1) = path(i - 1).
     bounds : Bounds
-        Kept where that is possible; the caller checks.
+        Kept if possible; the caller checks.
 
     Returns
     -------
@@ -159,7 +159,7 @@ def solve_window(
 
 @contextlib.contextmanager
 def refusing_singular() -> Iterator[None]:
-    """Say in words that a window's problem cannot be solved."""
+    """Turn a singular window problem into a DesignError."""
     try:
         yield
     except np.linalg.LinAlgError as error:
@@ -169,7 +169,7 @@ def refusing_singular() -> Iterator[None]:
 def functions_of(
     design: PreviewDesign, *, at_rests: bool, part: Condensed | None = None
 ) -> Functions:
-    """Return what windows solved by themselves need of a design, or of the part that counts."""
+    """Return the functions of a design, or of its reduced form, for windows solved singly."""
     lifted = design.lifted
     price = max(EFFORT_PRICE, design.price) if at_rests else design.price
     functions = Functions(
@@ -198,7 +198,7 @@ def functions_of(
 def within_bounds(
     functions: Functions, tied: Tied, z: Array, path_mm: Array, bounds: Bounds
 ) -> Array:
-    """Command of a window that keeps its bounds, where that is possible.
+    """Return the command of a window that keeps its bounds, if possible.
 
     Parameters
     ----------
@@ -207,13 +207,13 @@ def within_bounds(
         Its solution without bounds. In the coordinates w = L' c, normal = L L', the cost is
         |w - wish|^2: well conditioned even where a rest leaves few samples.
     z, path_mm, bounds
-        As `solve_window` has them.
+        As in `solve_window`.
     """
     command, rows, low, high = tied.command, tied.pinned, tied.values, tied.values
     last, previous = float(z[-2]), float(z[-1])
     taken = np.zeros((3, len(path_mm)), bool)
     while not bounds.kept(Extremes.of(command, last, previous)):
-        # Constraints where the command leaves its bounds, then where it does so instead.
+        # Add constraints where the command exceeds its bounds, and repeat for the new command.
         more = constraints_at(
             command,
             tied.fixed,
@@ -234,7 +234,7 @@ def within_bounds(
         one = np.eye(len(tied.wish))
         found, _, flag, _ = daqp.solve(one, -tied.wish, rows, high, low, kinds)
         if flag <= 0:
-            # Nothing keeps them; the caller sees that and takes a gentler design.
+            # Infeasible; the caller notices and uses a gentler design.
             return tied.command
         command = command_of(
             tied.factor, found, functions.basis, tied.moving, last, previous, path_mm

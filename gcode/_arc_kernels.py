@@ -60,7 +60,7 @@ _CURVE_MIN_STEP, _CURVE_MAX_STEP, _CURVE_SIGMA_MM = 0.002, 0.1, 0.1
 
 @kernel
 def arc_pieces(f: Any, rule: int, radius: float, angle: float, rise: float, whole: bool) -> float:
-    """Return into how many straight pieces an arc is cut (a whole number)."""
+    """Return the number of straight pieces of an arc (a whole number)."""
     flat = radius * fabs(angle)
     if rule <= _MARLIN_2_0:
         length = hypot(flat, rise) if rise != 0.0 else flat
@@ -100,13 +100,13 @@ def _center(
     there: Any,
     out: Any,
 ) -> int:
-    """Find the way from the start to the centre; return OK or why there is none."""
+    """Compute the vector from the start to the centre; return OK or why there is none."""
     out[0] = out[1] = 0.0
     if mask & (1 << _R):
         if rule == _KLIPPER:
             return ERROR_ARC_RADIUS
         r = w[_R] * unit
-        # Marlin works R out in X and Y whatever the plane is.
+        # Marlin computes R in X and Y in every plane.
         p = a if rule == _REPRAP else 0
         q = b if rule == _REPRAP else 1
         dp = there[p] - here[p]
@@ -136,7 +136,7 @@ def _center(
 
 @kernel
 def _whole_turn(rule: int, angle: float, here: Any, there: Any, a: int, b: int) -> bool:
-    """Tell whether an arc that ends where it began goes once around."""
+    """Return whether an arc that ends at its start is a full circle."""
     if rule == _MARLIN_2_1:
         return fabs(here[a] - there[a]) < _NEAR_MM and fabs(here[b] - there[b]) < _NEAR_MM
     if rule == _MARLIN_2_0:

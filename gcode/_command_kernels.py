@@ -58,7 +58,7 @@ _BARE_IS_ZERO, _OFFSET, _POSITION = 0, 1, 2
 
 @kernel(allocates=False)
 def execute(action: int, w: Any, mask: int, f: Any, i: Any, rows: Any, tables: Any) -> int:
-    """Carry out one command of the kernel's table; write its move or event.
+    """Execute one command of the kernel's table; write its move or event.
 
     Parameters
     ----------
@@ -174,7 +174,7 @@ def _set_position(w: Any, mask: int, f: Any, i: Any, rows: Any, tables: Any) -> 
             f[F_BASE + k] = f[F_LAST + k]
         i[I_ORIGIN_KNOWN] = i[I_KNOWN]
     if places:
-        settle(f, i, rows)  # the machine did not come here along a path
+        settle(f, i, rows)  # the machine did not get here along a path
     note_modal(f, i, tables)
     put_event(i, rows, _UNKNOWN if places else _MODE)
     return OK

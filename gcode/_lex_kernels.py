@@ -4,10 +4,10 @@ One call of `run` walks over whole lines of a buffer and writes rows of moves an
 early with a status when a line needs Python (`HANDBACK`), when the output is full (`FULL`), when
 a table must grow (`GROW`) or when the line is an error.
 
-Behind the last line of the buffer there must be room of `PADDING` bytes that begins with a newline.
+The last line of the buffer must be followed by `PADDING` bytes that begin with a newline.
 
-Rows and tables are a hundred numbers to hand on, so what is called for every tenth line (`plain`,
-`recall`) is inlined.
+Passing rows and tables is costly (a hundred numbers), so functions called for every tenth line
+(`plain`, `recall`) are inlined.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ _MOVES = 22  # actions 20 to 22 are G0 to G3
 
 @kernel(force_inline=True, allocates=False)
 def recall(buf: Any, start: int, stop: int, f: Any, i: Any, rows: Any, tables: Any) -> int:
-    """Do what the line did when Python carried it out; HANDBACK if it is not remembered."""
+    """Repeat the remembered effect of a line; HANDBACK if there is none."""
     slot = memo_slot(tables.memo_keys, line_hash(buf, start, stop))
     if tables.memo_keys[slot] == 0:
         return HANDBACK

@@ -1,4 +1,4 @@
-"""Kernels of straight moves: G0 and G1, and what all moves come down to.
+"""Kernels of straight moves: G0 and G1, and the move shared by all commands.
 
 Sources: Klipper klippy/extras/gcode_move.py, 2026-08; Marlin Marlin/src/gcode/gcode.cpp
 (get_destination_from_command), bugfix-2.1.x of 2024; RepRapFirmware src/GCodes/GCodes.cpp
@@ -70,9 +70,9 @@ def travel(
     Parameters
     ----------
     named : int
-        Bit per axis that an absolute coordinate has made known.
+        Bit per axis named by an absolute coordinate.
     trusted : bool
-        False marks the row as unknown on all axes: its line is more than a plain move.
+        False marks the row as unknown on all axes: its line does more than move.
 
     Returns
     -------
@@ -146,7 +146,7 @@ def set_feed(f: Any, i: Any, feed: float) -> int:
 
 @kernel(allocates=False)
 def extruder_is_absolute(i: Any) -> bool:
-    """Tell whether E counts from the origin."""
+    """Return whether E is absolute."""
     return bool(i[I_ABS_E] != 0 and (i[I_E_RULE] != 0 or i[I_ABS_XYZ] != 0))
 
 
@@ -191,7 +191,7 @@ def move(
             f[F_LAST + 3] = scaled + f[F_BASE + 3]
         else:
             f[F_LAST + 3] += scaled
-    # A coordinate that only seems to stand where we guess the axis to be may well move it.
+    # A coordinate equal to the guessed position may still move the axis.
     guessed = named & ~i[I_KNOWN]
     status = travel(f, i, named & i[I_ORIGIN_KNOWN], True, rows)
     f[F_SPEED] = normal_mm_s

@@ -1,9 +1,9 @@
 """The kernel of plain lines: G0 and G1 with X Y Z E F in decimal numbers, comments, empty lines.
 
-They are nearly all of a print file, so this is where its speed comes from: the state is held in
-local variables and numbers are read eight characters at a time. Whatever is not plain (another
-word, an unusual number, a place outside the travel, an axis that becomes known) is left to
-`_lex_kernels.run`, which reads the same line again by the same rules and says what is wrong.
+They make up nearly all of a print file, so they are optimised: the state is held in local variables
+and numbers are read eight characters at a time. Anything else (another word, an unusual number, a
+position outside the travel, an axis that becomes known) is left to `_lex_kernels.run`, which reads
+the same line again by the same rules and reports errors.
 """
 
 from __future__ import annotations
@@ -88,18 +88,17 @@ def eight_digits(digits: Any) -> Any:
 
 @kernel(force_inline=True, allocates=False)
 def decimal(buf: Any, p: int) -> Any:
-    """Read a number; return it and where it ends, or -1 where it is no plain one.
+    """Read a number; return it and its end, or -1 if it is not plain.
 
-    A plain number has up to 7 digits before and after its point and none of it left out but
-    either part. It is read as a whole number over a power of ten, both exact, so that the quotient
-    is the nearest double.
+    A plain number has up to 7 digits before and after its point; either part may be missing. It is
+    read as an integer over a power of ten, both exact, so that the quotient is the nearest double.
     """
     c = byte_at(buf, p)
     negative = c == 45
     if negative or c == 43:
         p += 1
     digits = word_at(buf, p) ^ _ZEROS
-    # The lowest byte that is no digit gets its high bit set; bytes after it may lie.
+    # The lowest non-digit byte gets its high bit set; later bytes are not reliable.
     others = ((digits + _ABOVE_NINE) | digits) & _HIGH_BITS
     n = trailing_zeros(others) >> _THREE
     if n == _EIGHT:
@@ -139,7 +138,7 @@ def decimal(buf: Any, p: int) -> Any:
 
 @kernel(allocates=False)
 def may_be_mark(buf: Any, p: int) -> bool:
-    """Tell whether a comment (p: after its semicolon) may be one that `recall` knows."""
+    """Return whether a comment (p: after its semicolon) may be one that `recall` knows."""
     c = byte_at(buf, p)
     while c == 32 or c == 59:
         p += 1
@@ -149,7 +148,7 @@ def may_be_mark(buf: Any, p: int) -> bool:
 
 @kernel(allocates=False)
 def line_end(buf: Any, p: int) -> int:
-    """Find the newline at or after p."""
+    """Return the position of the newline at or after p."""
     while True:
         other = word_at(buf, p) ^ _NEWLINES
         found = (other - _LOW_BITS) & ~other & _HIGH_BITS
@@ -188,7 +187,7 @@ def _end_of_words(buf: Any, p: int) -> int:
 
 @kernel(force_inline=True, allocates=False)
 def plain(buf: Any, stop: int, f: Any, i: Any, rows: Any, m_words: Any) -> None:
-    """Read plain lines from I_POS on; stop in front of the first that is not plain."""
+    """Read plain lines from I_POS on; stop before the first one that is not plain."""
     if f[F_UNIT_MM] != 1.0 or f[F_UNIT_E_MM] != 1.0 or i[I_HOLD]:
         return
     pos, line, offset = i[I_POS], i[I_LINE], i[I_OFFSET]

@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 
 class Plan(NamedTuple):
-    """What positions take of `gcode.types.Phases`."""
+    """The columns of `gcode.types.Phases` that positions depend on."""
 
     t_s: Array
     accel_s: Array
@@ -42,9 +42,9 @@ def sweep(
 ) -> None:
     """Fill `position` and `row` (n) at t0 + (first + k) dt.
 
-    `position` has the first two rows or more of x y z e. Between phases and after the last one
-    the tool stands where the phase before ended. `inside` (n), or nothing, tells which samples are
-    not later than `until` of their phase.
+    `position` has at least the first two rows of x y z e. Between phases and after the last one the
+    tool stands at the end of the previous phase. `inside` (n), or empty, receives whether samples
+    are no later than `until` of their phase.
     """
     moves = len(plan.t_s)
     count = len(row)
@@ -63,7 +63,7 @@ def sweep(
         if stop == k:
             continue
         begin, accel, cruise, decel, v0, v1, rate, eased = _move(plan, m)
-        # Each part of the move by itself, so that a sample asks nothing: the way goes to x first.
+        # One loop per part of the move avoids branches per sample; x holds the path length first.
         way, number = position[0, k:stop], first + k
         if eased:
             for i in range(len(way)):
@@ -115,7 +115,7 @@ def _move(plan: Plan, m: int) -> tuple[float, float, float, float, float, float,
 
 @kernel(inline=True, allocates=False)
 def _place(t_s: float, t0_s: float, dt_s: float, first: int, low: int, high: int) -> int:
-    """Return about which sample is the first that is not before a time, low to high."""
+    """Return an estimate of the first sample not before a time, within low to high."""
     guess = np.ceil((t_s - t0_s) / dt_s) - first
     return int(min(max(guess, float(low)), float(high)))
 
@@ -133,7 +133,7 @@ def _passed(
 ) -> int:
     """Return the first sample, low to high, after a part of a move.
 
-    The part comes `before` seconds after the move's begin, and `lasts` so long.
+    The part begins `before` seconds into the move, and has the duration `lasts`.
     """
     at = _place(begin + before + lasts, t0_s, dt_s, first, low, high)
     while at > low and t0_s + (first + at - 1) * dt_s - begin - before > lasts:
@@ -210,7 +210,7 @@ def _way(
     rate: float,
     eased: bool,
 ) -> float:
-    """Way along a move so long after it began.
+    """Return the distance along a move after a time.
 
     On an s_curve the speed between v and v + d follows Marlin's quintic Bezier,
     v + d (10 u^3 - 15 u^4 + 6 u^5) with u from 0 to 1 (stepper.cpp, bugfix-2.1.x, 2026-08).
@@ -232,7 +232,7 @@ def _way(
 
 @kernel(inline=True, allocates=False)
 def _eased(v_mm_s: float, accel_mm_s2: float, whole_s: float, part_s: float) -> float:
-    """Way after `part_s` of a change of speed by ``accel * whole_s`` along the Bezier curve."""
+    """Return the distance after `part_s` of a Bezier speed change by ``accel * whole_s``."""
     u = part_s / whole_s if whole_s > 0.0 else 0.0
     bend = u * u * u * u * (2.5 + u * (u - 3.0))
     return v_mm_s * part_s + accel_mm_s2 * whole_s * whole_s * bend

@@ -1,4 +1,4 @@
-"""Loops of the one-pass segment fit; `gcode.segments` wraps them."""
+"""Kernels of the one-pass segment fit, wrapped by `gcode.segments`."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from stillpath.models.jit import kernel
 __all__ = ["LONGEST", "Answers", "Bounds", "fit_stretch", "path_directions", "rest_errors"]
 
 LONGEST = 64
-"""Segments of up to so many samples end where the machine answers their error least."""
+"""Longest segment whose end is chosen for the least response to its error."""
 
 
 class Bounds(NamedTuple):
-    """How far a segment may be from the command, mm, and its speed (mm/s) from the last one's.
+    """Tolerances of a segment [mm], and its largest speed step [mm/s].
 
-    Along and across the path, by how much the funnel in which the end is chosen is wider, z and e;
-    and by how much the speed of an axis may step.
+    Tolerances along and across the path, the widening of the funnel in which the end is chosen, and
+    tolerances of z and e; then the largest speed step of an axis.
     """
 
     along_mm: float
@@ -31,22 +31,22 @@ class Bounds(NamedTuple):
 
 
 class Answers(NamedTuple):
-    """What a machine with answers of the form of `models.modal` makes of a fit's errors.
+    """Tables of a machine's response to a fit's errors, in the form of `models.modal`.
 
-    A segment that begins with sample k and covers m samples has an error of its straight line, and
-    one that rises from 0 to `shift` over these and falls over the next as its end is shifted. The
-    energy of the answer to all that has been, with the shifted end, is least where `shift` is
-    minus (Re(head[m] state) + echo[m] error) / norm[m]; all sums go on to the end of the answer.
+    A segment of m samples has the error of its straight line, plus one that rises from 0 to `shift`
+    over these samples and falls over the next ones if its end is shifted. The energy of the
+    response to all errors so far is least for `shift` = -(Re(head[m] state) + echo[m] error) /
+    norm[m]; all sums extend to the end of the response.
 
     Attributes
     ----------
     pole : ndarray of complex128, shape (axes, order)
     power : ndarray of complex128, shape (axes, LONGEST, order)
-        Powers of the poles: what becomes of an error.
+        Powers of the poles: the decay of an error.
     head : ndarray of complex128, shape (axes, LONGEST + 1, order)
     echo : ndarray, shape (axes, LONGEST + 1, LONGEST)
     lift : ndarray of complex128, shape (axes, LONGEST + 1, order)
-        What a shift by 1 adds to the state at the segment's end.
+        Change of the state at the segment's end per unit shift.
     norm : ndarray, shape (axes, LONGEST + 1)
     """
 
@@ -60,7 +60,7 @@ class Answers(NamedTuple):
 
 @kernel
 def path_directions(path: NDArray[np.float64], out: NDArray[np.float64]) -> None:
-    """Find the unit direction of the path (2, n) at every sample; at a stand, the last one."""
+    """Compute the unit direction of the path (2, n) at every sample, held at standstill."""
     n = path.shape[1]
     x, y = 1.0, 0.0
     for k in range(n):
@@ -104,10 +104,10 @@ def fit_stretch(
     """Cover samples first..last of `position` (x y z e, n) with straight segments.
 
     The fit starts at `begin` at `start_s` and ends exactly at sample `last`. A funnel of slopes in
-    the frame of the path's direction says how long a segment may be; where exactly it ends,
-    inside the (slightly looser) funnel, is chosen so that the machine's answer to the error stays
-    small. `states` (axes, order) carries that answer and is updated in place. With `level` set z
-    is the same at `begin` and at all samples. `errors` (LONGEST,) is scratch.
+    the frame of the path's direction determines the length of a segment; its exact end, inside the
+    (slightly wider) funnel, is chosen so that the machine's response to the error stays small.
+    `states` (axes, order) is the state of that response and is updated in place. With `level` set,
+    z is the same at `begin` and at all samples. `errors` (LONGEST,) is scratch.
     Vertices in X and Y lie on multiples of `grid`; they are written from row `begun` on. A segment
     is cut short where the speed of an axis would step too far, as far as one sample allows.
     Returns their number.
@@ -148,7 +148,7 @@ def fit_stretch(
             dx, dy = cx * along - cy * across, cy * along + cx * across
             new_x, new_y = grid * np.round((x + dx) / grid), grid * np.round((y + dy) / grid)
             if abs(new_x - x) <= 0.5 * grid and abs(new_y - y) <= 0.5 * grid:
-                # A segment of no length cannot pass the time; one grid step can.
+                # A segment of zero length has no duration; one of a grid step has.
                 if abs(dx) >= abs(dy):
                     new_x = x + (grid if dx >= 0.0 else -grid)
                 else:
@@ -218,7 +218,7 @@ def _reach(
             position[2, j] - z,
             position[3, j] - e,
         )
-        # Where the path has turned, slack along the frame is slack across the path.
+        # Where the path has turned, tolerance along the frame acts across the path.
         turn = abs(cx * direction[1, j] - cy * direction[0, j])
         slack = along
         if turn * along > 0.5 * across:
@@ -259,7 +259,7 @@ def _least_answer(
     states: NDArray[np.complex128],
     errors: NDArray[np.float64],
 ) -> float:
-    """Take the states of an axis along a straight line that ends on the last sample.
+    """Advance the states of an axis along a straight line that ends on the last sample.
 
     `begin` is where it starts, `since_s` before the first sample. Returns by how much the end is
     best shifted. `errors` (LONGEST,) is scratch.

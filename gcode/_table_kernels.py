@@ -1,4 +1,4 @@
-"""Kernels for what the interpreter writes down: lines to remember, limits, modes, moves, events.
+"""Kernels that store the interpreter's output: remembered lines, limits, modes, moves, events.
 
 Rows are written in two steps. What differs from row to row is written at once; what stays the same
 over many rows (modes, layer, feature, object, tool) is filled in by `settle` whenever it is about
@@ -69,8 +69,8 @@ from stillpath.models.jit import kernel
 class Rows(NamedTuple):
     """The columns that one block of the program is written to, with room for the same number each.
 
-    There are few arrays because kernels hand them on, and every one of them costs time; and they
-    lie in one piece of memory, which is soon had again when a block is forgotten.
+    There are few arrays because passing each between kernels costs time. They share one block of
+    memory, which is quickly reused when a block is freed.
     """
 
     real: NDArray[np.float64]
@@ -147,7 +147,7 @@ class Rows(NamedTuple):
 
 
 class Tables(NamedTuple):
-    """What many rows refer to, and what many lines mean."""
+    """Tables that rows refer to, and the remembered meaning of lines."""
 
     limits: NDArray[np.float64]
     limits_index: NDArray[np.int32]
@@ -176,8 +176,8 @@ _HASH_PRIME, _ONE, _29 = np.uint64(0x9E3779B97F4A7C15), np.uint64(1), np.uint64(
 def line_hash(text: Any, start: int, stop: int) -> int:
     """Hash the bytes to a positive int64; after them there must be room of 8 bytes.
 
-    As FNV-1a does, but eight bytes at a time: no two texts of up to eight have the same hash but
-    for the bit of the sign.
+    Like FNV-1a, but eight bytes at a time: texts of up to eight bytes collide only through the sign
+    bit.
     """
     h = np.uint64(stop - start)
     for p in range(start, stop, 8):
@@ -231,7 +231,7 @@ def intern_row(rows: Any, index: Any, count: int) -> int:
 
 @kernel(allocates=False)
 def _start_anew(f: Any, i: Any, rows: Any) -> None:
-    """Have the next move start where the tool is; so far each started where the last one ended."""
+    """Let the next move start at the tool's position instead of the end of the last move."""
     apart = False
     for k in range(4):
         apart = apart or f[F_RUN + k] != f[F_TOOL + k]
@@ -334,8 +334,7 @@ def note_limits(f: Any, i: Any, rows: Any, tables: Any) -> None:
 def recall_limits(line: int, f: Any, i: Any, rows: Any, tables: Any) -> None:
     """Set the limits that a remembered line sets.
 
-    Slicers change the same few limits to and fro, so the row that it led to the last time is most
-    often the one again.
+    Slicers alternate between a few limits, so the row found the last time is usually right again.
     """
     before, after = i[I_LIMITS_ID], tables.memo_after
     if after[line, 0] != before:

@@ -1,4 +1,4 @@
-"""Handles comments: the marks of slicers and our own, for all lines after them."""
+"""Handle comments: the marks of slicers and our own, which apply to the lines after them."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""Detects the firmware that a file was written for.
+"""Detect the firmware that a file was written for.
 
-A file never says it for sure: Klipper users slice with Marlin's flavour and add macros, and slicers
-write words of all firmwares into every file. So every sign has a weight, commands more than what
-the slicer calls its flavour, and a result says how sure it is and why.
+A file never states it reliably: Klipper users slice with Marlin's flavour and add macros, and
+slicers write commands of all firmwares into every file. So every sign has a weight, commands more
+than the slicer's stated flavour, and a result includes its certainty and reasons.
 
 Sources: the output of the slicers in `gcode.slicers.marks`; `gcode_flavor` of PrusaSlicer 2.9
 (src/libslic3r/PrintConfig.cpp) and OrcaSlicer 2.3; ``;FLAVOR:`` of CuraEngine 4.13.
@@ -19,12 +19,12 @@ DIALECTS = ("klipper", "marlin", "reprapfirmware", "prusa", "bambu")
 _HEAD_BYTES = 1 << 18
 _TAIL_BYTES = 1 << 18
 _SURE = 4.0
-"""A sum of weights that nothing speaks against is certain from here on."""
+"""Sum of weights from which an uncontradicted result is certain."""
 
 
 @dataclass(frozen=True, slots=True)
 class Detection:
-    """For which firmware a file was written, as far as it shows.
+    """The firmware that a file was probably written for.
 
     Attributes
     ----------
@@ -33,7 +33,7 @@ class Detection:
     certainty : float
         From 0 (nothing tells) to 1.
     reasons : tuple of str
-        What speaks for it, and after "but" what speaks for another one.
+        Evidence for it and, after "but", for another one.
     """
 
     dialect: str
@@ -42,7 +42,7 @@ class Detection:
 
     @property
     def doubtful(self) -> bool:
-        """Whether a person should look."""
+        """Whether a user should check."""
         return self.certainty < 0.5
 
 
@@ -166,7 +166,7 @@ def detect(head: bytes, tail: bytes = b"") -> Detection:
     head, tail : bytes
         The two ends of its text; a quarter of a megabyte of each is looked at.
     """
-    # Nearly all of it are moves, which no sign looks at.
+    # Moves are most of the text, and no sign matches them.
     text = _MOVES.sub(b"\n", head[:_HEAD_BYTES] + b"\n" + tail[-_TAIL_BYTES:])
     found = [sign for sign in _SIGNS if sign.pattern.search(text)]
     weights = dict.fromkeys(DIALECTS, 0.0)

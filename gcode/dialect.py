@@ -1,6 +1,6 @@
 """The dialect of a firmware: one table of its rules and commands.
 
-The interpreter (`gcode.interpreter`) is one for all; a `Dialect` says where firmwares differ. Each
+The interpreter (`gcode.interpreter`) is shared; a `Dialect` says where firmwares differ. Each
 firmware's own is in `gcode/firmware/*/dialect.py`; docs/dialects.md shows them side by side.
 """
 
@@ -58,8 +58,8 @@ Handler: TypeAlias = "Callable[[MachineState, Command], int]"
 """Carries out a command; returns a status of the kernel (0: done)."""
 
 Word: TypeAlias = "EventKind | Action | Handler"
-"""What a command is: a line that only leaves its event, one that the kernel carries out, or one
-that Python does."""
+"""Handling of a command: a line that only leaves an event, one executed by the kernel, or by a
+Python handler."""
 
 _TABLE_SIZE = 1024
 NEEDED: Mapping[str, str] = MappingProxyType(
@@ -85,11 +85,11 @@ class Dialect:
     Attributes
     ----------
     name, title : str
-        As it is asked for, and as people call it.
+        Name in options, and name shown to users.
     words : mapping of str to Word
         Every command that is known to do something, or to do nothing.
     otherwise : function of str to EventKind
-        What a command does that no table has.
+        Effect of a command that is not in the table.
     """
 
     name: str
@@ -147,7 +147,7 @@ class Dialect:
     odd_words: str = ""
     """Letters that make a move (G0 to G3) something special."""
     odd_move: Handler | None = None
-    """Carries such a move out; returns -1 where it is an ordinary one after all."""
+    """Executes such a move; returns -1 if it is an ordinary one."""
     needed: Mapping[str, str] = field(default_factory=lambda: NEEDED)
     """Words whose numbers the kernel's commands need."""
     start_speed_mm_s: float = 25.0

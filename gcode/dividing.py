@@ -19,14 +19,14 @@ from stillpath.models.runs import runs
 __all__ = ["divided", "sections"]
 
 _SLOW_MM_S = 15.0
-"""From here it is a few milliseconds to a stand, and to this speed again."""
+"""From this speed, stopping and restarting takes only a few milliseconds."""
 
 
 def sections(piece: Piece) -> list[tuple[int, int]]:
     """Return runs of moves of X or Y between which a piece may be cut, in order.
 
-    Between two of them lies a rest, or the machine is slow where printing begins or ends: it can
-    stand still there without losing time that counts. No cut lies within a line.
+    They are separated by a rest, or by a place where printing begins or ends slowly: the machine
+    can stop there without a significant loss of time. No cut lies within a line.
 
     Returns
     -------
@@ -57,8 +57,8 @@ def divided(piece: Piece, wanted: NDArray[np.bool_], machine: Machine) -> Iterat
     Yields
     ------
     Piece or LeftOut
-        In order; their texts add up to the piece's. A part is planned anew, from rest to rest,
-        where the firmware would pass through the rest that bounds it without stopping.
+        In order; their texts add up to the piece's. A part is planned again, from rest to rest, if
+        the firmware would otherwise pass the cut without stopping.
     """
     if np.all(wanted):
         yield piece

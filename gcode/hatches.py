@@ -166,7 +166,7 @@ def sample_hatches(hatches: Hatches, dt_s: float, timing: Timing) -> ScanSamples
 
 
 class _Reader:
-    """The state between lines."""
+    """Parser with its state between lines."""
 
     def __init__(self, text: str) -> None:
         codes = {letter + digits for letter, digits in _CODES.findall(text.upper())}

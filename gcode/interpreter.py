@@ -1,9 +1,9 @@
-"""Interprets bytes as moves and events by the dialect of a firmware.
+"""Interpret bytes as moves and events by the dialect of a firmware.
 
-`Interpreter` takes a file in pieces of any size. The kernel (`_lex_kernels.run`) carries out the
-plain lines; lines it hands back are carried out here and it goes on after them. Every byte of
-the file belongs to exactly one line, and every line is one event, or one or more moves, or moves
-and after them the event that stops the machine.
+`Interpreter` takes a file in chunks of any size. The kernel (`_lex_kernels.run`) executes the plain
+lines; lines that it hands back are executed here. Every byte of the file belongs to exactly one
+line, and every line is one event, or one or more moves, or moves followed by the event that stops
+the machine.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _BLOCK_BYTES, _CHUNK = 1 << 17, 1 << 20
 _LONGEST_LINE = 1 << 24
 _LONGEST_COMMAND = 65_536
 _FEWEST_ROWS, _MOST_ROWS = 1024, 32_768
-_SHORT_LINE = 24  # bytes; rows are made for lines of this length, a little less than is usual
+_SHORT_LINE = 24  # bytes; rows are allocated for lines of about this length
 _SPARE_ROWS = 8  # as many as one command of Python's may write
 
 
@@ -127,7 +127,7 @@ class Interpreter:
         return int(self.state.i[at.I_KNOWN])
 
     def push(self, data: bytes) -> list[ProgramBlock]:
-        """Take the next bytes of the file; return the content of its complete lines.
+        """Read the next bytes of the file; return the content of complete lines.
 
         Raises
         ------
@@ -157,7 +157,7 @@ class Interpreter:
         yield from self.flush()
 
     def snapshot(self) -> Interpreter:
-        """Return an interpreter that goes on from here, whatever this one reads next."""
+        """Return an independent interpreter that continues from here."""
         other = copy.copy(self)
         other.state = self.state.snapshot()
         for name in ("_modal", "_limits", "_carry"):
@@ -185,7 +185,7 @@ class Interpreter:
 
     def _read(self, text: bytes) -> list[ProgramBlock]:
         """Read whole lines; after them is the padding."""
-        # Only meanwhile: snapshots that hold themselves would wait for the garbage collector.
+        # Set only temporarily: a reference cycle would delay freeing snapshots.
         self.state.carry_out = self._command
         try:
             return self._read_lines(text)
@@ -240,7 +240,7 @@ class Interpreter:
         moves = state.rows.moves(n, apart=bool(i[at.I_APART]))
         events = state.rows.events(m)
         if 2 * (n + m) < state.rows.room:
-            # A few rows would keep the room for many.
+            # A view of a few rows would keep the whole buffer alive.
             moves = {name: column.copy() for name, column in moves.items()}
             events = {name: column.copy() for name, column in events.items()}
         block = ProgramBlock(
@@ -292,7 +292,7 @@ class Interpreter:
         state.span = (start, end - 1 if self._text[end - 1 : end] == b"\n" else end)
         commands = self._split(text)
         if len(commands) > 1:
-            state.remembers = False  # what one of them does is not what the line does
+            state.remembers = False  # the effect of one command is not that of the line
             status = self._several(commands)
             state.remembers = True
             return status
@@ -356,7 +356,7 @@ class Interpreter:
         return state.event(EventKind.UNKNOWN)
 
     def _classic(self, action: Action, name: str, command: Command) -> int:
-        """Do with Python's number reader what the kernel does with its own."""
+        """Execute a kernel command with numbers parsed in Python."""
         state = self.state
         if Action.MOVE <= action <= Action.ARC_CCW:
             odd = self.dialect.odd_move
@@ -385,9 +385,9 @@ class Interpreter:
         return execute(int(action), state.w, mask, state.f, state.i, state.rows, state.tables)
 
     def _several(self, commands: list[Command]) -> int:
-        """Carry out the commands of one line; it stays whole, so its moves are not ours.
+        """Execute the commands of one line, which stays whole, so its moves are not replaced.
 
-        Nor are modes and limits that it sets: none of it may be held back.
+        Nor may modes and limits that it sets be held back.
         """
         state, i = self.state, self.state.i
         before = state.f.copy(), i.copy()
@@ -422,7 +422,7 @@ class Interpreter:
         return at.OK
 
     def _failed(self, status: int) -> int:
-        """Raise what is wrong with the line in hand, unless the firmware passes it over."""
+        """Raise the error of the current line, unless the firmware skips it."""
         state, i, f = self.state, self.state.i, self.state.f
         if status == at.ERROR_ARC_CENTER and self.dialect.bad_arcs_pass:
             state.warn(f"{self.dialect.title} passes over an arc without a centre")
@@ -475,10 +475,10 @@ _BLANK_OR_DIGIT = frozenset(bytes([c]) for c in b" 0123456789")
 
 
 def _together(kinds: set[EventKind]) -> EventKind:
-    """Return what a line does whose commands do this."""
+    """Return the combined effect of the commands of a line."""
     told = kinds - {EventKind.HARMLESS}
     if EventKind.UNKNOWN in told or (EventKind.SHAPER in told and len(told) > 1):
-        # A line that sets the shaper is said again behind streams, and this does more.
+        # A line that sets the shaper is repeated after streams, but this one does more.
         return EventKind.UNKNOWN
     # Where the motion stops, modes and what the printer keeps are the file's.
     stopping = told - {EventKind.MODE, EventKind.LIMITS, EventKind.STATE}

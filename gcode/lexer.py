@@ -1,6 +1,6 @@
 """Split one line into commands and their words, as the firmware of a dialect does.
 
-This is the slow and complete reading; `_lex_kernels.run` reads the plain lines itself.
+This is the slow and complete parser; `_lex_kernels.run` parses the plain lines itself.
 
 Sources: Klipper klippy/gcode.py, 2026-08; Marlin Marlin/src/gcode/parser.cpp and queue.cpp, 2.0.x
 of 2021 and bugfix-2.1.x; RepRapFirmware src/GCodes/GCodeBuffer/StringParser.cpp, 3.5.
@@ -43,9 +43,9 @@ class Command:
     text : str
         The whole line as it was read.
     dropped : str
-        Why the firmware passes the line over without reading it; empty: it does not.
+        Why the firmware skips the line without reading it; empty: it reads it.
     uncertain : bool
-        A value is an expression that only the firmware can work out.
+        A value is an expression that only the firmware can evaluate.
     """
 
     name: str
@@ -162,7 +162,7 @@ def _without_comments(line: str, dialect: Dialect) -> str:
 
 
 def _bad_checksum(code: str) -> str:
-    """Say why RepRapFirmware drops a numbered line, or return nothing."""
+    """Return why RepRapFirmware drops a numbered line; empty if it does not."""
     start = code.upper().find("N")
     star = code.find("*")
     if star < 0:
@@ -288,9 +288,9 @@ def _pairs(text: str, name: str) -> Mapping[str, str]:
 
 
 def odd_numbers(command: Command) -> Iterator[tuple[str, str]]:
-    """Yield words of a move that are no numbers, each with what is read of it: perhaps nothing.
+    """Yield words of a move that are not numbers, each with the part that firmwares read.
 
-    Firmwares that read as far as they can take X1.2.3 for X1.2 and pass XNaN over.
+    Firmwares that read as far as they can take X1.2.3 for X1.2 and skip XNaN.
     """
     code = command.text.split(";", 1)[0].upper()
     for letter, text in command.words.items():

@@ -35,7 +35,7 @@ def meta_command(state: MachineState, command: Command) -> int:
 
 
 def held_back(state: MachineState, command: Command) -> int | None:
-    """Pass by a line of a conditional block; None: the block has ended or there is none."""
+    """Handle a line of a conditional block; None: the block has ended or there is none."""
     if state.conditional_indent < 0:
         return None
     if _indent(command.text) <= state.conditional_indent:
@@ -54,7 +54,7 @@ def held_back(state: MachineState, command: Command) -> int | None:
 
 
 def _indent(text: str) -> int:
-    """Measure the indentation: a tab goes on to the next multiple of 4."""
+    """Return the indentation; a tab extends to the next multiple of 4."""
     width = 0
     for c in text:
         if c == " ":

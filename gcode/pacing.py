@@ -1,8 +1,8 @@
 """Replan a piece with other accelerations and speeds, one class of moves after the other.
 
-Geometry, filament and the order of the lines stay; so do the speeds at which plastic is laid, for
-they hold what a slicer decided: flow, cooling, overhangs, small perimeters. What changes are the
-accelerations of X and Y, the speed at which corners are passed, and the speed of travel.
+Geometry, filament and the order of the lines stay; so do extruding speeds, which reflect the
+slicer's decisions on flow, cooling, overhangs and small perimeters. What changes are the
+accelerations of X and Y, the speed at corners, and the speed of travel.
 
 The first layer keeps all it has, and so do wipes (the extruder's own limits bind them), and moves
 of Z or of the extruder alone.
@@ -40,13 +40,13 @@ TRAVEL, AS_SLICED = -2, -3
 """Classes beside the features, whose ids begin at -1 (unnamed)."""
 
 _ACCEL_ROOM, _SPEED_ROOM = 0.7, 0.9
-"""Parts of the command's limits that a plan may use: the command itself swings beyond the plan."""
+"""Shares of the command's limits for the plan: the command itself exceeds the plan."""
 _SAME_Z_MM = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """How much quicker a class of moves is than the file has it: ratios, above 0."""
+    """Ratios, above 0, of a class's accelerations and speed to the file's."""
 
     accel: float = 1.0
     speed: float = 1.0
@@ -58,14 +58,14 @@ SAME = Pace()
 
 @dataclass(frozen=True, slots=True)
 class FirstLayer:
-    """What sticks to the bed, of all objects where they are printed one after another.
+    """The first layer, of all objects if they are printed one after another.
 
     Attributes
     ----------
     below : int
-        Layers below are part of it; -1 where the file does not tell its layers.
+        Layers below this number belong to it; -1 if the file does not mark layers.
     z_mm : float
-        What is not higher is part of it too; minus infinity where the height is unknown.
+        Moves up to this height belong to it too; minus infinity if unknown.
     """
 
     below: int = 1
@@ -98,7 +98,7 @@ def move_classes(moves: Moves, first_layer: FirstLayer = FirstLayer()) -> Ints:
 
 
 def top_limits(machine: Machine) -> CommandLimits:
-    """Return what no plan is raised above."""
+    """Return the upper bounds of a plan's limits."""
     return machine.command.every_way.scaled(velocity=_SPEED_ROOM, accel=_ACCEL_ROOM)
 
 
@@ -111,7 +111,7 @@ def paced(piece: Piece, classes: Ints, paces: Mapping[int, Pace], machine: Machi
     classes : ndarray of int32, shape (moves of the piece,)
         As `move_classes` gives them.
     paces : mapping
-        Class to pace; one that is not named keeps what it has.
+        Class to pace; classes not listed keep theirs.
     machine : Machine
 
     Returns

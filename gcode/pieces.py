@@ -72,4 +72,4 @@ class Piece(VerbatimPart):
 
 
 class LeftOut(VerbatimPart):
-    """Lines that could be compensated and stay as sliced because somebody chose so."""
+    """Lines that could be compensated but stay as sliced on request."""

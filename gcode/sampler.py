@@ -1,7 +1,7 @@
 """Positions along planned moves, at given times or on a uniform grid.
 
-`sample_phases` samples phases that are all at hand; `Sampler` takes them as they come and gives
-one unbroken uniform grid, standing still through dwells and stops.
+`sample_phases` samples a complete set of phases; `Sampler` takes them as they come and returns one
+continuous uniform grid, standing still during dwells and stops.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def sample_phases(
     t_s : ndarray, shape (n,), or tuple (t0, dt, n)
         Ascending times, or the grid ``t0 + k dt``.
     flat : bool
-        x and y are all that is wanted.
+        Only x and y are wanted.
 
     Returns
     -------
@@ -105,7 +105,7 @@ def sample_until(
     *,
     axes: int = 4,
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.bool_]]:
-    """Sample planned moves on a grid, and say which samples come in time.
+    """Sample planned moves on a grid, and return which samples are in time.
 
     Parameters
     ----------
@@ -149,8 +149,8 @@ def distances(
     first : ndarray of int64, shape (stretches,)
         Point that each stretch begins with, rising from 0.
     late_s, until_s : ndarray, shape (stretches,)
-        The points of a stretch belong to times so much later, and to this at the latest. Time
-        never goes back: one before the time of an earlier point counts as that.
+        Delay of the points of a stretch, and their latest time. Time never decreases: a point
+        before an earlier one has the time of that.
     """
     _check(phases)
     out = np.empty(points_mm.shape[1])

@@ -1,10 +1,10 @@
-"""The fewest straight constant-speed segments that follow a sampled command within a tolerance.
+"""Fit few straight constant-speed segments to a sampled command within a tolerance.
 
 One pass over X, Y, Z and E together: a funnel of admissible slopes starts at the end of the last
 segment and narrows with every sample; when it closes, the segment ends. The tolerance across the
-path, which one sees on the part, is tighter than along it. Within the funnel the end point is
-chosen by noise shaping: the error of a fit with some 200 corners a second falls right on a
-machine's resonances, and is steered to where the machine does not answer.
+path, which is visible on the part, is tighter than along it. Within the funnel the end point is
+chosen by noise shaping: the error of a fit with some 200 corners per second lies right at a
+machine's resonances, and is moved to frequencies at which the machine does not respond.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ ALONG_SHARE = 0.8
 LOOSE_MM = 0.3e-3
 FULL_GAIN = 5.0
 BEYOND_MODEL = 0.5
-"""Added to what a machine answers to an error. A model ends with its band, a machine does not: all
-of the error would otherwise be steered to frequencies of which nothing is known."""
+"""Added to a machine's response to an error. A model ends with its band, a machine does not: all of
+the error would otherwise be moved to frequencies at which the machine is unknown."""
 Z_TOLERANCE_MM = 1e-3
 E_TOLERANCE_MM = 3e-4
-"""Filament that comes unevenly is a step of the extruder's speed, which firmwares brake for."""
+"""Uneven filament means steps of the extruder's speed, for which firmwares brake."""
 END_SPEED_MM_S = 8.0
-"""A stretch does not crawl into a Z move slower than this: the Z move would start as slowly."""
+"""Lowest speed at the end of a stretch before a Z move, which would start as slowly."""
 END_EXCESS_MM = 1.5e-3
 SHORTEST_S = 0.5e-3
 """Samples nearer than this to the start of a stretch are not ends of segments."""
@@ -60,7 +60,7 @@ class Segments:
     group : ndarray of int64, shape (n,)
         The timeline's group it belongs to.
     error_filter : ErrorFilter, optional
-        How the machine answers errors: for who moves the ends.
+        The machine's response to errors, for later changes of the ends.
     """
 
     end_s: NDArray[np.float64]
@@ -84,19 +84,19 @@ class Segments:
 
 
 class ErrorFilter:
-    """How the machine answers an error of the fit, for X and Y.
+    """The machine's response to an error of the fit, for X and Y.
 
     Parameters
     ----------
     plants : sequence of DiscretePlant
-        Plants of X and Y at the sampling time of the fit. A plant whose modes crowd too much for
-        partial fractions is taken as answering everything alike.
+        Plants of X and Y at the sampling time of the fit. A plant whose modes are too close for
+        partial fractions is assumed to respond equally at all frequencies.
 
     Notes
     -----
-    `share` is how much of the tolerance is used: all of it up to a resonance of `FULL_GAIN`.
-    The answer to an error e is direct e + sum of Re(weight x) with x <- pole x + e. `answers` is
-    for the kernel; products of answers, summed up to their end, are geometric series.
+    `share` is the share of the tolerance that is used: all of it up to a resonance of `FULL_GAIN`.
+    The response to an error e is direct e + sum of Re(weight x) with x <- pole x + e. `answers` is
+    for the kernel; sums of products of responses are geometric series.
     """
 
     def __init__(self, plants: Sequence[DiscretePlant]) -> None:
@@ -142,13 +142,13 @@ def fit_segments(
     tolerance_mm : float
         Largest distance in X Y between command and fit.
     error_filter : ErrorFilter
-        The machine's answer to the error.
+        The machine's response to the error.
     step_mm_s : float
         Segments are cut short where the speed of an axis would step by more.
     grid_mm : float
         X and Y of all vertices but the last of a stretch are multiples of this.
     """
-    # A vertex on a coarse grid (a motor's whole steps) lies up to half of it beside its place.
+    # A vertex on a coarse grid (whole motor steps) is up to half a grid step off.
     slack_mm = max(0.5 * (grid_mm - tolerance_mm), 0.0)
     bounds = Bounds(
         along_mm=ALONG_SHARE * error_filter.share * tolerance_mm + slack_mm,
@@ -196,7 +196,7 @@ class _Fit:
         self._count = 0
 
     def rest(self, duration_s: float) -> None:
-        """Let errors die down."""
+        """Let errors decay."""
         samples = round(duration_s / self._timeline.dt_s)
         rest_errors(self._filter.answers.pole, self._states, samples)
 
@@ -272,7 +272,7 @@ def _merge_crawl(
 def _peak_gain(
     pole: NDArray[np.complex128], weight: NDArray[np.complex128], direct: NDArray[np.float64]
 ) -> float:
-    """Largest answer of an axis to a sine below a quarter of the sampling rate."""
+    """Return the largest gain of an axis below a quarter of the sampling rate."""
     z = np.exp(1j * np.linspace(0.0, 0.5 * np.pi, 2001))[:, None]
     pole, weight = pole[:, None], weight[:, None]
     sums = weight / (z - pole) + weight.conj() / (z - pole.conj())
@@ -285,7 +285,7 @@ def _tables(
     """`power`, `head`, `echo`, `lift` and `norm` of one axis (`Answers`)."""
     lag = np.arange(2 * LONGEST)
     power = pole ** lag[:, None]
-    # Two answers multiplied and summed up: a series for every pair of poles.
+    # Summed products of two responses: a geometric series for every pair of poles.
     series = (
         weight / (1.0 - np.outer(pole, pole)),
         weight.conj() / (1.0 - np.outer(pole, pole.conj())),

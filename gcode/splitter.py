@@ -35,18 +35,18 @@ S = TypeVar("S", Moves, Events)
 R = TypeVar("R")
 
 WILD_FEED_MM, WILD_RATIO = 10.0, 5.0
-"""A move that feeds more filament than the first, and per mm of its way more than the second, is
-one of the extruder: X and Y creep, and would be cut into thousands of segments."""
+"""A move that feeds more filament than the first, and per mm of path more than the second, counts
+as an extruder move: X and Y creep, and would be cut into thousands of segments."""
 
 _AHEAD = 1.25
-"""How much more than a piece may last is planned before it is cut."""
+"""Time planned before a piece is cut, relative to its longest duration."""
 _MOST_MOVES, _MOST_EVENTS, _MOST_BYTES = 1 << 15, 1 << 16, 1 << 23
-"""What a piece may hold. A minute of ordinary prints has 15 thousand moves at the very most; of
+"""Largest contents of a piece. A minute of an ordinary print has at most 15 thousand moves; with
 moves of a micrometre it would have millions."""
 
 _SET_POSITION = re.compile(rb"G\s*0*92(?!\d)")
 _SET_EXTRUDER = re.compile(rb"\s*(?:N\d+\s*)?G92\s*E\s*[-+]?(?:\d+\.?\d*|\.\d+)\s*(?:\*\d+\s*)?")
-"""What every firmware reads alike; odder spellings end a piece."""
+"""A spelling that all firmwares read alike; others end a piece."""
 
 
 class Splitter:
@@ -138,10 +138,10 @@ class Splitter:
         return [self._tables[0][k] for k in limits], [self._tables[1][k] for k in modal]
 
     def _first_barrier(self, events: Events, most: int) -> int | None:
-        """Return the first of `most` moves after which a piece cannot go on; None: there is none.
+        """Return the first of `most` moves after which a piece must end; None: there is none.
 
-        A stop ends a piece, G92 unless it is of one plain E, M221, or a stream's other limits. What
-        lies before the first move does not.
+        A piece ends at a stop, a G92 other than one plain E, M221, and a change of the stream's
+        limits, but not at those before its first move.
         """
         limits, modal = self._tables
         count = int(np.searchsorted(events.move_index, most, "right"))
@@ -155,7 +155,7 @@ class Splitter:
         others = _changes(
             self._limits_id, events.limits_id[of_limits], limits, self._adapter.stream_limits
         )
-        # Where E counts differently from here on, it must be where the file says.
+        # Where the scale of E changes, the extruder must be at the file's position.
         factors = _changes(
             self._modal_id, events.modal_id[of_mode], modal, lambda state: state.extrude_factor
         )
@@ -172,7 +172,7 @@ class Splitter:
         """Mark moves of X or Y that must keep their lines, and all that bring back a state."""
         moves = block.moves
         travel, xy = moves.end_mm - moves.start_mm, moves.moves_xy
-        # Our lines name places; where Z is not known, a line that moves it cannot be one of them.
+        # Our lines state positions, so a move of Z cannot be replaced where Z is unknown.
         needed = np.where(travel[:, 2] != 0.0, 7, 3)
         raw = xy & (((moves.known & needed) != needed) | ((moves.known & KEPT) != 0))
         raw |= xy & _finds_height(block)
@@ -181,7 +181,7 @@ class Splitter:
         raw |= xy & (length > self._longest_s * moves.speed_mm_s)
         feed = np.abs(travel[:, 3])
         raw |= xy & (feed > WILD_FEED_MM) & (feed > WILD_RATIO * length)
-        # After an object mark the firmware may jump: that travel runs as the slicer wrote it.
+        # After an object mark the firmware may skip lines: keep that travel as sliced.
         marks = events.move_index[events.kind == EventKind.OBJECT]
         if self._after_mark:
             marks = np.concatenate([[0], marks])
@@ -190,7 +190,7 @@ class Splitter:
         self._after_mark = bool(np.any(following == len(xy_rows)))
         raw[xy_rows[following[following < len(xy_rows)]]] = True
         if len(moves):
-            # All pieces of an arc share one line and one fate.
+            # All segments of an arc share one line and are treated alike.
             starts = np.flatnonzero(np.append(True, np.diff(moves.line) != 0))
             ends = np.append(starts[1:], len(raw))
             # A piece cannot begin or end within a line, nor where X and Y rest.
@@ -223,7 +223,7 @@ class Splitter:
             last = int(np.flatnonzero(xy[:end])[-1]) + 1
             phases = self._plan(rows_of(moves, slice(0, last)))
             if len(phases) != last or not np.all(np.any(travel[:last] != 0.0, axis=1)):
-                # A move of no length has no plan; leave its neighbourhood as it is.
+                # A move of zero length has no plan; leave its neighbourhood unchanged.
                 self._raw[:last] |= xy[:last]
                 continue
             slow = phases.lasts_s > self._longest_s
@@ -248,9 +248,9 @@ class Splitter:
         return plan_moves(moves, self._tables[0], self._machine, rests_apart=True)
 
     def _enough(self, moves: Moves, lasting_s: NDArray[np.float64]) -> int:
-        """Return how many of the moves are worth planning: they last longer than a piece may.
+        """Return how many moves to plan, so that they last longer than a piece may.
 
-        All pieces of an arc, and some more moves: the plan's end makes those before it slower.
+        This includes whole arcs and some more moves, as the end of a plan slows those before it.
         """
         rows = int(np.searchsorted(lasting_s, _AHEAD * self._longest_s)) + 1
         if rows >= len(moves):
@@ -335,7 +335,7 @@ def _changes(
     table: list[R],
     seen: Callable[[R], Hashable],
 ) -> NDArray[np.bool_]:
-    """Tell after which of a row of events something seen of their rows of a table is another."""
+    """Mark events after which `seen` of their table row differs from that before."""
     used, place = np.unique(np.append(before, after), return_inverse=True)
     numbers: dict[Hashable, int] = {}
     number = [numbers.setdefault(seen(table[row]), len(numbers)) for row in used.tolist()]
@@ -344,13 +344,13 @@ def _changes(
 
 @lru_cache(maxsize=64)
 def _shifts_origin(line: bytes) -> bool:
-    """Whether a line is a G92 of more than a plain E; files repeat such lines by thousands."""
+    """Return whether a line is a G92 other than a plain E; cached, as files repeat such lines."""
     code = line.split(b";", 1)[0].upper()
     return bool(_SET_POSITION.search(code)) and not _SET_EXTRUDER.fullmatch(code)
 
 
 def _finds_height(block: ProgramBlock) -> NDArray[np.bool_]:
-    """Mark moves whose lines name Z where it is only guessed: they may well climb."""
+    """Mark moves whose lines name Z while it is only guessed: they may climb."""
     moves = block.moves
     known = (moves.known & 4) != 0
     found = ~known & np.append(known[1:], False)
@@ -360,7 +360,7 @@ def _finds_height(block: ProgramBlock) -> NDArray[np.bool_]:
 
 
 def _place_to_cut(moves: Moves, phases: Phases, longest_s: float) -> tuple[int, bool]:
-    """Row after which to end a piece, and whether the plan stops there by itself.
+    """Return the row after which to end a piece, and whether the plan stops there anyway.
 
     The best place is a rest before filament is fed again (nothing oozes there), then any
     extruder-only move, then a Z move, then the slowest corner of the last ten seconds.

@@ -39,7 +39,7 @@ __all__ = ["MachineState", "Names", "Retraction", "Saved", "nobody"]
 _MEMOS = 8192
 _FIRST_ROWS = 256
 _MOST_ROWS = 4096
-"""Rows of a table; a longer one forgets its rows as soon as nobody needs them."""
+"""Size of a table above which it is cleared as soon as its rows are no longer needed."""
 _LAYERS = 1024
 
 
@@ -85,7 +85,7 @@ class MachineState:
     carry_out : function
         Carries out another command of the same line (the interpreter's).
     warnings : dict of str to int
-        What the firmware passes over or what cannot be known, and the line where it came first.
+        What the firmware skips or what is unknown, with the line of first occurrence.
     """
 
     def __init__(self, machine: Machine, dialect: Dialect, limits: Limits, *, strict: bool) -> None:
@@ -144,7 +144,7 @@ class MachineState:
         self.note_limits()
 
     def snapshot(self) -> MachineState:
-        """Return a state that goes on from here, whatever becomes of this one."""
+        """Return an independent copy of the state."""
         other = copy.copy(self)
         for name, value in vars(self).items():
             if isinstance(value, np.ndarray | dict | Names):
@@ -167,18 +167,18 @@ class MachineState:
         return at.OK
 
     def forget(self, axes: int = 0b111, *, origin: bool = False) -> None:
-        """Take the place of axes for unknown, and where their coordinates count from."""
+        """Mark the positions of axes as unknown and, with `origin`, also their origins."""
         self.settle()
         self.i[at.I_KNOWN] &= ~axes
         if origin:
             self.i[at.I_ORIGIN_KNOWN] &= ~axes
 
     def travel(self) -> int:
-        """Go to F_LAST for a line that is more than a plain move, and stays."""
+        """Go to F_LAST for a line that does more than move, and must stay."""
         return travel(self.f, self.i, 0, False, self.rows)
 
     def travel_to_kept(self) -> int:
-        """Go to F_LAST for a line that depends on what the printer keeps, its F for one."""
+        """Go to F_LAST for a line that depends on the printer's stored state, such as its F."""
         move = int(self.i[at.I_MOVES])
         status = self.travel()
         if status == at.DONE:
@@ -188,7 +188,7 @@ class MachineState:
         return status
 
     def moved(self, status: int) -> int:
-        """Turn the status of `travel` into that of a line: without a move there is an event."""
+        """Turn the status of `travel` into that of a line: without a move, write an event."""
         return self.event(EventKind.MODE) if status == at.DONE else status
 
     def home(self, axes: int, home_mm: tuple[float, float, float] | None) -> None:
@@ -208,7 +208,7 @@ class MachineState:
         self.note_modal()
 
     def settle(self) -> None:
-        """Fill the rows before something changes that many rows share."""
+        """Fill the rows before a value shared by many rows changes."""
         settle(self.f, self.i, self.rows)
         settle_limits(self.i, self.rows)
 
@@ -247,7 +247,7 @@ class MachineState:
         return self.event(kind)
 
     def remember(self, command: Command, what: int, value: int) -> bool:
-        """Have the kernel do the same whenever the line comes again."""
+        """Let the kernel repeat this effect whenever the line recurs."""
         known_whole = self.remembers and self.conditional_indent < 0 and not command.dropped
         if self.memos >= _MEMOS // 2 or not known_whole:
             return False
@@ -310,7 +310,7 @@ class MachineState:
         return GcodeError(message, line=int(self.i[at.I_LINE]), text=command.text)
 
     def warn(self, message: str) -> None:
-        """Note what a person should know; the first line of each message counts."""
+        """Record a warning with the first line at which it occurs."""
         if len(self.warnings) < 100:
             self.warnings.setdefault(message, int(self.i[at.I_LINE]))
 
@@ -322,7 +322,7 @@ class MachineState:
     # Room
 
     def allocate(self, count: int) -> None:
-        """Make room for the next rows; those before belong to somebody else."""
+        """Allocate new rows; the previous ones have been passed on."""
         self.rows = Rows.empty(count)
         i = self.i
         i[at.I_MOVES] = i[at.I_EVENTS] = i[at.I_FILLED_MOVES] = i[at.I_FILLED_EVENTS] = 0

@@ -2,9 +2,9 @@
 
 A *piece* is a row of planned moves that starts and ends at rest. Inside it, moves of X and Y form
 *stretches*; between them lie *rests*, moves of the extruder or of Z alone, which are written
-unchanged while X and Y stand still. How long a rest takes is decided by the limits under which the
-written file will run, not by the original ones, so the rests' durations are an input here and the
-stretches move in time. A rest starts on the sampling grid; a stretch starts where its rest ends.
+unchanged while X and Y stand still. The duration of a rest depends on the limits of the written
+file, not on the original ones, so the rests' durations are an input here and stretches are shifted
+in time. A rest starts on the sampling grid; a stretch starts where its rest ends.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from stillpath.gcode.types import Phases
 __all__ = ["Group", "Timeline", "build_timeline", "group_rows"]
 
 _GRID_EPS = 1e-6
-"""Samples are compared with times to this part of a sample."""
+"""Tolerance, in samples, when comparing samples with times."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,16 +160,16 @@ def _laid(
             start[i], end[i] = now, now + rest_s[i]
             row_start[rows] = now + scale * offset[:-1]
             first = int(np.ceil(now / dt_s - _GRID_EPS)) + 1
-            # The first move after the rest gets a whole sample's time, or it would be a jerk.
+            # The first move after the rest gets at least a whole sample, to avoid a jerk.
             last = int(np.ceil(end[i] / dt_s - _GRID_EPS)) + 1
-            # However short: the command must be on the path when the rest's own line comes.
+            # At least one sample: the command must be on the path when the rest's own line comes.
             rests.append((first, max(last, first + 1)))
             now = end[i]
         else:
             start[i] = now
             row_start[rows] = now + lead_s + offset[:-1]
             now = dt_s * np.ceil((now + lead_s + offset[-1] + tail_s) / dt_s - _GRID_EPS)
-            # However short: a stretch has a sample of its own after the rest.
+            # A stretch has at least one sample of its own after the rest.
             now = max(now, dt_s * (rests[-1][1] if rests else 1))
             end[i] = now
     return start, end, row_start, rests

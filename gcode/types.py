@@ -36,7 +36,7 @@ OF_STATE = 16
 
 
 class EventKind(IntEnum):
-    """What a line that is no move does to the motion."""
+    """The effect on the motion of a line that is not a move."""
 
     HARMLESS = 0
     """Does not stop the motion and changes nothing that we track: comments, fan, M73, ..."""
@@ -101,8 +101,8 @@ class Moves:
     Attributes
     ----------
     start_mm, end_mm : ndarray, shape (n, 4)
-        x y z in machine axes and e as the firmware's cumulative extruder position. Not to be
-        written to: as a rule they are the same numbers in memory, one row apart.
+        x y z in machine axes and e as the firmware's cumulative extruder position. Read-only: they
+        usually share memory, one row apart.
     speed_mm_s : ndarray, shape (n,)
         Requested speed: F times the speed factor, before any limit.
     limits_id, modal_id : ndarray of int32, shape (n,)
@@ -155,7 +155,7 @@ class Events:
     kind : ndarray of int8, shape (n,)
         An `EventKind`.
     move_index : ndarray of int64, shape (n,)
-        How many moves of the whole file stand before the line.
+        Number of moves in the file before the line.
     modal_id, limits_id : ndarray of int32, shape (n,)
         The state AFTER the line.
     dwell_s : ndarray, shape (n,)
@@ -193,8 +193,8 @@ class TextLines:
 class ProgramBlock(TextLines):
     """One block of an interpreted file.
 
-    `limits` and `modal` are the interpreter's tables. They only grow, and blocks share them, until
-    they are large: then both are begun anew, and ids of the blocks before mean nothing in them.
+    `limits` and `modal` are the interpreter's tables. They are shared by blocks and only grow,
+    until they are large: then both are restarted, and ids of earlier blocks are not valid in them.
     `text` holds the bytes from `text_offset` on, and covers every line of the block.
     """
 

@@ -1,4 +1,4 @@
-"""Loops of dry friction; `models.friction` gives them names."""
+"""Kernels of dry friction, wrapped by `models.friction`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _ROUNDS = 3
 
 @kernel(allocates=False)
 def bent(way: Array, bend: float, out: Array) -> None:
-    """Fill what a way from rest bends the guides by, -1 to 1 (Dahl 1968), exact between samples."""
+    """Compute the bend of guides along a path from rest, -1 to 1 (Dahl 1968), exactly."""
     now = 0.0
     out[0] = now
     for k in range(1, len(way)):
@@ -29,7 +29,7 @@ def bent(way: Array, bend: float, out: Array) -> None:
 
 @kernel(allocates=False)
 def received(command: Array, held: float, bend: float, state: Array, out: Array) -> None:
-    """Fill w with w + held bent(w) = command; `state` is (command, w, bent) of the last sample."""
+    """Solve w + held bent(w) = command; `state` is (command, w, bent) of the last sample."""
     before, w, now = state[0], state[1], state[2]
     for k in range(len(command)):
         step = command[k] - before

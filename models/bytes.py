@@ -1,7 +1,7 @@
 """Bytes of a text as kernels see them: single ones, and eight at a time.
 
-These are functions for the inside of kernels only. They do not look at the array's length: whoever
-calls them makes sure that what is read is there.
+These functions are for use inside kernels only. They do not check the array's length; the caller
+must ensure that the bytes exist.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def _word_at(_typing: Any, text: Any, offset: Any) -> Any:
 
 @intrinsic
 def _trailing_zeros(_typing: Any, _value: Any) -> Any:
-    """Return how many of the lowest bits of a uint64 are 0; 64 for 0."""
+    """Return the number of trailing zero bits of a uint64; 64 for 0."""
 
     def generate(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
         return builder.cttz(args[0], ir.Constant(ir.IntType(1), 0))

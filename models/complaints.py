@@ -9,7 +9,7 @@ from typing import Any
 __all__ = ["complaint"]
 
 _SHOWN = 80
-"""Characters of a wrong value that are repeated."""
+"""Longest part of a wrong value that a message repeats."""
 
 _MUST = {
     "greater_than": "must be more than {gt}{unit}",
@@ -88,5 +88,5 @@ def _unit(place: tuple[int | str, ...]) -> str:
 
 
 def _number(value: object) -> str:
-    """Return a number as short as it is exact, anything else as it is."""
+    """Return the shortest exact form of a number; other values unchanged."""
     return f"{value:.12g}" if isinstance(value, float) else str(value)

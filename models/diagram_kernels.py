@@ -1,6 +1,6 @@
-"""The loop of a block diagram; `models.diagrams` gives it names and checks.
+"""Kernel of a block diagram, wrapped and checked by `models.diagrams`.
 
-It lies here because a feedback design asks it for stability as a simulation does for signals.
+It is in this layer because both feedback designs (for stability) and simulations use it.
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ def advance(
     runs, needs its input at once. `shape` has rows (quantum, limit). `state` holds the states of
     all filters, then all delay lines; `cursor` the place of the oldest sample of each line.
 
-    A tick has three passes: blocks that answer from memory speak first, then the others in their
-    order, and last the first ones hear what they were told.
+    A tick has three passes: blocks without direct feedthrough write their output, then the others
+    run in order, and finally the first ones read their inputs.
     """
     blocks = len(layout)
     memory = np.zeros(blocks)
@@ -106,7 +106,7 @@ def advance(
         for j in range(len(watched)):
             records[j, k] = signals[watched[j]]
         if (k & _FLUSH) == _FLUSH:
-            # A decaying state ends in denormal numbers, which cost a hundredfold.
+            # Flush decayed states to zero: denormal numbers are a hundred times slower.
             for i in range(len(state)):
                 if abs(state[i]) < _TINY:
                     state[i] = 0.0

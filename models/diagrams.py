@@ -1,9 +1,9 @@
 """Block diagrams of sampled loops: one description to simulate, to analyse and to load.
 
 A diagram is a list of blocks that read and write signals by name. A block is a causal filter;
-it may run at every k-th tick only (several rates in one diagram), and may round or clip what it
-gives. A machine's loop, a sensor, friction and every feedback design are such lists, so what is
-judged stable is what is simulated and what a controller loads.
+it may run at every k-th tick only (several rates in one diagram), and may round or clip its output.
+A machine's loop, a sensor, friction and every feedback design are such lists, so the stability
+check, the simulation and the loaded controller use the same description.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Block:
         Write 0 at the other ticks instead of holding (zero insertion).
     quantum, limit : float
         Output rounded to multiples of `quantum` (0: not), then clipped to +-`limit`; the filter
-        goes on with the value before. Friction is a clipped multiple of a velocity.
+        continues with the unrounded value. Friction is a clipped multiple of a velocity.
     """
 
     output: str
@@ -110,7 +110,7 @@ class Diagram:
 
     @property
     def states(self) -> int:
-        """Numbers the diagram remembers from tick to tick, held outputs not counted."""
+        """Number of states carried from tick to tick, without held outputs."""
         return sum(b.order + b.delay for b in self.blocks)
 
     @property
@@ -139,7 +139,7 @@ class Diagram:
         Raises
         ------
         ModelError
-            If the diagram has several rates: a tone in gives many out.
+            If the diagram has several rates: one input tone then causes many output tones.
         """
         if self.period > 1:
             raise ModelError("a diagram of several rates has no frequency response")
@@ -157,7 +157,7 @@ class Diagram:
 
 
 class Running:
-    """A diagram with its states; it goes on where it stopped.
+    """A running diagram with its states; `push` continues where the last call ended.
 
     Attributes
     ----------
@@ -214,8 +214,8 @@ class Running:
         blocks : iterable of Block
             Same outputs, wires, orders and delays as before.
         reset : bool
-            Set the states of these blocks to 0. Without, a filter goes on with the states of
-            its former coefficients: right for small steps only (finding 1f of the reference).
+            Set the states of these blocks to 0. Otherwise a filter keeps the states of its former
+            coefficients, which is right only for small changes (finding 1f of the reference).
 
         Raises
         ------
@@ -330,7 +330,7 @@ def _check(blocks: tuple[Block, ...]) -> None:
 
 
 def _ordered(blocks: tuple[Block, ...]) -> tuple[Block, ...]:
-    """Put blocks that need their input at once after those who write it."""
+    """Sort blocks with direct feedthrough after those that write their inputs."""
     done = [b for b in blocks if not b.direct]
     waiting = [b for b in blocks if b.direct]
     while waiting:
@@ -352,7 +352,7 @@ def _padded(coefficients: Coefficients, order: int) -> Array:
 
 
 def _frame(block: Block) -> tuple[object, ...]:
-    """Tell what a replacement must keep."""
+    """Return what a replacement must keep."""
     return (
         [name for name, _ in block.inputs],
         block.order,

@@ -1,4 +1,4 @@
-"""The base of everything that is read from a JSON document, and the kinds of numbers in it."""
+"""The base class of all JSON documents, and the constrained number types in them."""
 
 from __future__ import annotations
 

@@ -1,13 +1,13 @@
 """Dry friction of guides: how far it holds an axis back, and which command compensates for it.
 
-Friction of force F holds what slides F/k behind its command, k the stiffness of belt and motor: c
-micrometres, against the direction of motion. As a sliding surface is first bent and then dragged
-along (Dahl 1968), it turns over within some micrometres of way. The force enters where the belt
-pulls, so the plant G answers a command that was held back:
+A friction force F holds the sliding part F/k behind its command, k the stiffness of belt and motor:
+c micrometres, against the direction of motion. As a sliding contact is first bent and then dragged
+along (Dahl 1968), it reverses within some micrometres of travel. The force acts where the belt
+pulls, so the plant G responds to the command that is left after friction:
 
     y = G w,    w + c s(w) = u,    |s| <= 1 the bend.
 
-No command that is linear in the path does anything about that; u = w + c s(w) does away with it.
+No command linear in the path can compensate for that; u = w + c s(w) does.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ __all__ = ["BEND_MM", "DryFriction", "bend_of"]
 Array = NDArray[np.float64]
 
 BEND_MM = 0.01
-"""Way over which friction turns over: 5 to 20 um on rolling and sliding guides. Half or twice as
+"""Travel over which friction reverses: 5 to 20 um on rolling and sliding guides. Half or twice as
 much changes contour errors by a few per cent."""
 
 
 def bend_of(way_mm: Array) -> Array:
-    """Return s along a way from rest, shape (n,)."""
+    """Return s along a path from rest, shape (n,)."""
     out = np.empty(len(way_mm))
     if len(out):
         bent(np.ascontiguousarray(way_mm), BEND_MM, out)
@@ -37,12 +37,12 @@ def bend_of(way_mm: Array) -> Array:
 
 
 class DryFriction:
-    """Dry friction of several axes, met by commands that arrive in blocks.
+    """Dry friction of several axes, applied to commands that arrive in blocks.
 
     Parameters
     ----------
     held_mm : sequence of float
-        How far each axis is held back; 0: not at all.
+        Distance by which friction holds each axis back; 0: no friction.
     """
 
     def __init__(self, held_mm: Sequence[float]) -> None:
@@ -50,11 +50,11 @@ class DryFriction:
         self._states: Array | None = None
 
     def __bool__(self) -> bool:
-        """Whether there is any."""
+        """Whether any axis has friction."""
         return any(self._held)
 
     def stand(self) -> None:
-        """Stand still, unbent, from here on."""
+        """Reset to standstill with unbent guides."""
         self._states = None
 
     def received_mm(self, command_mm: Array) -> Array:

@@ -1,11 +1,11 @@
-"""A typed face for numba's decorator, so that kernels stay visible to mypy.
+"""A typed wrapper of numba's decorator, so that mypy sees kernels, and its cache on disk.
 
-Every kernel of the house is compiled at its first use once per machine type and kept on disk,
-releases the GIL, and keeps IEEE arithmetic (fastmath stays off: outputs must be reproducible).
+Every kernel is compiled at its first use once per machine type and cached on disk, releases the
+GIL, and keeps IEEE arithmetic (fastmath stays off: outputs must be reproducible).
 
-What is kept holds the code of the kernels that a kernel calls and the constants of other modules,
-and numba looks at the kernel's own file only. So the stamp that tells whether it is still good
-counts every module of ours that the kernel's module imports, and theirs.
+Cached code contains called kernels and constants of other modules, but numba checks only the
+kernel's own file. The cache's stamp therefore covers every module of ours that the kernel's module
+imports, directly or indirectly.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _IMPORT = re.compile(rb"^(?:from|import) +([A-Za-z_][\w.]*)", re.MULTILINE)
 
 
 class _ReadOnlyLocator(UserProvidedCacheLocator):
-    """A folder of kernels that can be read and not written, as that of an image."""
+    """A read-only folder of kernels, as in an image."""
 
     @classmethod
     def from_function(cls, function: Callable[..., Any], file: str) -> Any:
@@ -56,7 +56,7 @@ class _CacheImpl(CompileResultCacheImpl):
     def rebuild(self, target_context: Any, payload: Any) -> Any:
         """See `numba.core.caching.CacheImpl`, which would also read the kernel's LLVM code.
 
-        Only callers that are yet to be compiled need it, and reading it takes longer than the rest.
+        Only callers still to be compiled need it, and reading it takes longer than the rest.
         """
         (name, kind, (machine_code, llvm_code)), fndesc, *others, environments = payload
         engine = target_context.codegen()._engine
@@ -101,14 +101,14 @@ class _KernelCache(FunctionCache):
     def load_overload(self, signature: Any, target_context: Any) -> Any:
         """See `numba.core.caching.Cache`, which would import all that compiling needs first.
 
-        To run what was compiled, the memory of arrays (`rtsys`) is enough.
+        To run compiled code, the array runtime (`rtsys`) is enough.
         """
         rtsys.initialize(target_context)
         with self._guard_against_spurious_io_errors():
             try:
                 return self._load_overload(signature, target_context)  # type: ignore[no-untyped-call]
             except Exception:
-                # Half a file raises whatever its bytes happen to mean. It is written anew.
+                # A truncated file can raise anything. It is written again.
                 with contextlib.suppress(OSError):
                     self._cache_file.flush()  # type: ignore[no-untyped-call]
                 return None
@@ -183,13 +183,13 @@ def kernel(
     inline : bool
         Paste the body into its callers (for helpers of a few lines in a hot loop).
     force_inline : bool
-        Put the machine code into its callers, however long it is: a call costs its caller all that
-        it holds in registers.
+        Inline the machine code into callers whatever its length: a call forces the caller to spill
+        its registers.
     parallel : bool
         Allow `numba.prange`.
     allocates : bool
-        False: it neither makes nor returns arrays, so nobody has to count who holds them. That
-        counting costs more than the work of a small kernel that is handed many arrays.
+        False: it neither creates nor returns arrays, so reference counting is left out, which costs
+        more than the work of a small kernel with many array arguments.
     """
 
     def compiled(body: Callable[..., Any]) -> Callable[..., Any]:

@@ -23,9 +23,8 @@ def modal_form(plant: DiscretePlant) -> Array | None:
     Returns
     -------
     ndarray, shape (m, 4), or None
-        Rows (re lambda, im lambda, re w, im w), m a multiple of three (padded with zeros). None
-        when poles crowd so much that the partial fractions cancel (condition of the modal matrix
-        > 1e9).
+        Rows (re lambda, im lambda, re w, im w), m a multiple of three (padded with zeros). None if
+        poles are so close that the partial fractions cancel (condition of the modal matrix > 1e9).
     """
     if plant.order == 0:
         return np.zeros((0, 4))

@@ -1,8 +1,8 @@
 """A machine during its print: its plants at an operating point, and grids of such points.
 
-Compensators cannot follow a plant continuously. They work on a grid of operating points between
-which no resonance moves by more than a step: mass and height are rounded to it where the machine
-rests, x and y are blended by smooth weights that add up to 1.
+Compensators cannot follow a plant continuously. They use a grid of operating points between which
+no resonance moves by more than a step: mass and height are rounded to it where the machine rests, x
+and y are blended by smooth weights that sum to 1.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 
 
 def machine_at(machine: Machine, point: OperatingPoint) -> Machine:
-    """Return the machine as it is at a point: the same document, its plants put in, no schedules.
+    """Return the machine at a point: the same document with the plants there and no schedules.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""A generated test path: what a shaper is tuned on when the print itself is not yet known.
+"""A generated test path, on which shapers are tuned while the print is not known.
 
 Squares, zigzags and circles at several speeds and accelerations, with the trapezoidal speed
 profile of a planner that takes every corner at 5 mm/s.
@@ -43,7 +43,7 @@ def reference_limits(machine: Machine) -> tuple[float, float]:
 def reference_motion_of(machine: Machine, dt_s: float = 1e-3) -> tuple[Array, NDArray[np.bool_]]:
     """Return the reference motion as the firmware of a machine would plan it.
 
-    What it would never plan tells nothing of the machine.
+    Motion that it would never plan is of no interest.
     """
     return reference_motion(dt_s, *reference_limits(machine))
 
@@ -136,7 +136,7 @@ def _drive(line: Array, speed_mm_s: float, accel_mm_s2: float, dt_s: float) -> A
                 times.append(times[-1] + 2 * distance / (speeds[-1] + v))
                 along.append(along[-1] + distance)
                 speeds.append(v)
-    # At least one sample beyond the end, so that the last one stands on it.
+    # At least one sample beyond the end, so that the last one is at the end point.
     t = np.arange(1, math.ceil(times[-1] / dt_s) + 1) * dt_s
     knot = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 2)
     into = np.minimum(t, times[-1]) - np.array(times)[knot]

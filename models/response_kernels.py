@@ -1,6 +1,6 @@
-"""Loops of the plant response; `simulation.response` gives them names and checks.
+"""Kernels of the plant response, wrapped and checked by `simulation.response`.
 
-They lie here because a compensator too asks what its plants will do.
+They are in this layer because compensators simulate their plants too.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def modal_response(modes: Array, d: float, origin: float, state: Array, u: Array
                 v_next = (c_re * v - c_im * w) + drive
                 w = c_im * v + c_re * w
                 v = v_next
-            # In a long rest the states decay into denormal numbers, which cost a hundredfold.
+            # Flush decayed states to zero: denormal numbers are a hundred times slower.
             if abs(p) + abs(q) < _TINY:
                 p = q = 0.0
             if abs(r) + abs(s) < _TINY:
@@ -111,7 +111,7 @@ def block_states(step: Array, drive: Array, state: Array, out: Array) -> None:
 
 @kernel(allocates=False)
 def in_blocks(u: Array, origin: float, out: Array) -> None:
-    """Lay a command, less `origin`, (blocks n,), into the first n columns of `out`; origin last."""
+    """Copy a command minus `origin`, (blocks n,), to the first n columns of `out`; origin last."""
     blocks, last = out.shape[0], out.shape[1] - 1
     n = len(u) // blocks
     for k in range(blocks):

@@ -41,7 +41,7 @@ class Roots:
 def dc_gain(
     zeros: NDArray[np.complex128], poles: NDArray[np.complex128], dt_s: float | None
 ) -> float:
-    """Return prod(v0 - zeros) / prod(v0 - poles), v0 = 0 of roots in s (no `dt_s`), 1 in z."""
+    """Return prod(v0 - zeros) / prod(v0 - poles), with v0 = 0 in s (no `dt_s`) and 1 in z."""
     at = 0.0 if dt_s is None else 1.0
     if np.any(poles == at):
         raise ModelError(

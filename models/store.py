@@ -95,7 +95,7 @@ def read_machine(document: str | bytes, source: str = "machine") -> Machine:
 def explain(error: ValidationError) -> str:
     """Return the first complaint about a document in one line, with the number of further ones."""
     complaints = error.errors(include_url=False)
-    # An unfitting branch of a union complains too; the deepest complaint is the one meant.
+    # Other branches of a union complain too; the deepest complaint is the relevant one.
     first = max(complaints, key=lambda c: len(c["loc"]))
     place = list(first["loc"])
     if place[:1] == ["firmware"] and place[1:2] and place[1] in FIRMWARE_KINDS:

@@ -1,8 +1,8 @@
-"""An axis of which somebody typed in one resonance, and what else such an axis may be.
+"""The plant set of an axis of which only one typed-in resonance is known.
 
-A ringing print or a tuned shaper says where an axis rings most, and nothing of its other modes,
-which sway the print as much. On virtual printers commands designed for that one mode print worse
-than the plain shaper at its frequency (docs/tried.md).
+A ringing print or a tuned shaper gives the strongest resonance of an axis, but not its other modes,
+which matter as much. On virtual printers, commands designed for that one mode print worse than the
+plain shaper at its frequency (docs/tried.md).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _SECOND, _SECOND_ZETA = (1.3, 3.5), 0.06
 
 
 def typed_in(f_hz: float, zeta: float) -> PlantSetSpec:
-    """Return an axis of one resonance, with what axes that ring there mostly are around it.
+    """Return an axis of one resonance, with members typical of axes that ring there.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def _spread(rng: np.random.Generator, sd: float) -> float:
 
 
 def stated_hz(axis: PlantSetSpec) -> float | None:
-    """Return the resonance of an axis of which no more is known; None of one that was measured."""
+    """Return the resonance of an axis with only a typed-in one; None for a measured axis."""
     about, plant = axis.provenance, axis.nominal
     if about is None or about.kind != "typed in":
         return None

@@ -1,4 +1,4 @@
-"""Files that a user names: read whole, but not beyond a size that such a file cannot have."""
+"""Read files named by a user, with a limit on their size."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def read_bytes(path: Path, largest: int, otherwise: str) -> bytes:
     largest : int
         Most bytes that are read.
     otherwise : str
-        What to say of a larger file, as "not a machine".
+        Message for a larger file, such as "not a machine".
 
     Raises
     ------

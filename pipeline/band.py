@@ -1,4 +1,4 @@
-"""How much of a planned motion lies beyond the band in which a machine's model is valid."""
+"""Measure how much of a planned motion lies above the band in which a model is valid."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ _ALL_BITS = 6
 """Long prints are thinned out: every second block after the first 64, every fourth after the
 first 128, and so on; each is weighted by the number of blocks it represents."""
 _TOGETHER = 16
-"""Blocks transformed at a time: setting a transform up costs more than one block."""
+"""Blocks transformed together, to share the overhead of a transform."""
 NOTABLE_UM = 1.0
-"""Motion beyond the band is reported from this size on."""
+"""Motion beyond the band is reported from this rms on."""
 
 
 class BandContent:
     """Spectrum of the planned motion of X and Y while it prints.
 
-    Blocks of 1024 samples (Welch 1967, Hann window, no overlap) of the planned acceleration, from
-    which a position's slow travel does not leak; |Y(f)| = |A(f)| / (2 sin(pi f dt) / dt)^2, as
-    second differences have it.
+    Blocks of 1024 samples (Welch 1967, Hann window, no overlap) of the planned acceleration, as
+    slow travel would leak from a spectrum of positions; |Y(f)| = |A(f)| / (2 sin(pi f dt) / dt)^2,
+    since the acceleration is a second difference.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ class BandContent:
         self._weights.clear()
 
     def warnings(self) -> list[str]:
-        """Return what lies outside the bands of the models, in words."""
+        """Return warnings about motion outside the bands of the models."""
         found = []
         for i, axis in enumerate(("x", "y")):
             plants = self._machine.axes[axis]  # type: ignore[index]
@@ -123,7 +123,7 @@ class BandContent:
 
 
 def _span(before: NDArray[T], newer: NDArray[T], start: int, stop: int) -> NDArray[T]:
-    """Return the samples start..stop - 1 of two arrays, the second being after the first."""
+    """Return samples start..stop - 1 of the concatenation of two arrays."""
     held = before.shape[-1]
     if start >= held:
         return newer[..., start - held : stop - held]

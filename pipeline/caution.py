@@ -1,9 +1,9 @@
 """Blend fbf with a shaper so that no likely plant does worse: what `robust=auto` decides.
 
 For every plant that explains the measurement, a file should print no worse than with the shaper
-that the same measurement leads to. Both commands are therefore tried on the reference motion with
+tuned from the same measurement. Both commands are therefore simulated on the reference motion with
 all members of the set, and the mixture is chosen that is best for the likely members without being
-bad for any. How much worse the worst member fares is stored with the choice.
+bad for any. The error ratio of the worst member is stored with the choice.
 """
 
 from __future__ import annotations
@@ -59,15 +59,15 @@ _SHARES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.2, 0.0)
 _UNSEEN_SHARE = 0.85
 """Largest share where the phase was not measured: a set cannot warn of what it does not contain."""
 _PRICE = 0.5
-"""Weight, in the ranking, of how much worse than with the shaper the worst member fares. Members
-contradict each other: to protect the least likely one would mean not to compensate the others."""
+"""Weight, in the ranking, of the worst member's error in excess of the shaper's. Members contradict
+each other: fully protecting the least likely one would mean not compensating the others."""
 _COARSE_UM, _LEAST_FIT = 4.0, 0.5
-"""Straight segments may use all of their tolerance from this contour error on, and at least this
-share of it below: on a well known machine they would otherwise be the larger error."""
+"""Contour error from which segments may use their full tolerance, and the least share of it below:
+on a well-known machine the segments would otherwise be the larger error."""
 _FRICTION_UNSURE = 0.25
-"""Relative error of friction identified from logs: often 10 % on virtual printers, seldom 25 %."""
+"""Relative error of identified friction: typically 10 % on virtual printers, rarely 25 %."""
 _STEPS_UNSURE = 0.2
-"""How much more or less than the nominal plants other plants make of whole motor steps: a guess."""
+"""Relative spread over the members of the error caused by whole motor steps: a guess."""
 _LAG_UNSURE_S = 1.5e-4
 """Unknown delay of X against Y: alignment sets both to 0, but viscous guides may delay one."""
 _STRIDE = 5
@@ -76,22 +76,22 @@ _NO_RESTS = np.zeros((0, 2), np.int64)
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """The mixture chosen for a machine, and what its set says of it on the reference motion.
+    """The mixture chosen for a machine, and its errors over the set on the reference motion.
 
     Attributes
     ----------
     shares : (float, float)
-        Of filtered basis functions in the command of X and Y.
+        Share of filtered basis functions in the command of X and Y.
     worst, mean : float
-        Largest over the members, and their geometric mean with their weights, of the contour error
-        against the shaper's.
+        Largest and weighted geometric mean, over the members, of the ratio of the contour error to
+        the shaper's.
     worst_to_none : float
-        Largest against no compensation.
+        Largest ratio to the contour error without compensation.
     rms_um : float
-        Contour error, geometric mean over the members with their weights.
+        Contour error, weighted geometric mean over the members.
     ranges : dict
-        By channel of a report, least and largest contour error of the members (delays and all)
-        against the nominal plants' with the same command.
+        By channel of a report, least and largest ratio of the members' contour error (delays
+        included) to the nominal plants' with the same command.
     reference_um : dict
         By channel, the nominal plants' contour error on the reference motion [um].
     """
@@ -106,7 +106,7 @@ class Choice:
 
     @property
     def fit_share(self) -> float:
-        """How much of the tolerance a fit to the command may use.
+        """Share of the tolerance that a fit to the command may use.
 
         A shaper's command has more edges: fitted to 2 um it leaves up to 1.2 times its error.
         """
@@ -117,13 +117,13 @@ class Choice:
     def ranged(self, channels: Sequence[Channel], *, steps: bool) -> list[Channel]:
         """Return the channels of a report with the range over the members.
 
-        Members differ in what they make of a command. What a firmware that moves in whole motor
-        steps adds to it is much the same for all of them: what is above the command's own error,
-        which follows from the reference motion and from how much harder this print shakes.
+        The error of a command differs between members; what whole motor steps add to it hardly
+        does. The two are told apart by the command's error on the reference motion, scaled by the
+        uncompensated error of this print.
         """
         before_um = next(c.judged_rms_um for c in channels if c.name == "before")
         harder = before_um / max(self.reference_um.get("before", 0.0), 1e-9)
-        found = []
+        updated = []
         for channel in channels:
             if channel.name in self.ranges:
                 all_um = channel.judged_rms_um
@@ -136,12 +136,12 @@ class Choice:
                     math.hypot(high * own_um, most * rounded_um),
                 )
                 channel = channel.model_copy(update={"contour_range_um": um})
-            found.append(channel)
-        return found
+            updated.append(channel)
+        return updated
 
 
 def measured_set(axis: PlantSetSpec) -> bool:
-    """Whether an axis has members that a measurement gave, each a plant of its own."""
+    """Return whether an axis has a set of several plants from a measurement."""
     members = isinstance(axis.members, tuple) and len(axis.members) > 1
     return members and stated_hz(axis) is None
 
@@ -152,9 +152,9 @@ def design_mode(machine: Machine) -> str:
 
 
 def set_or_nominal(mode: str, design: Callable[[str], T]) -> T:
-    """Return the design of a robust mode, or of the nominal plants where the set refuses itself.
+    """Return the design of a robust mode, or that of the nominal plants where it is refused.
 
-    Plants that ring for longer than any window make it do so.
+    A set is refused if some of its plants ring for longer than any window.
     """
     try:
         return design(mode)
@@ -167,11 +167,11 @@ def set_or_nominal(mode: str, design: Callable[[str], T]) -> T:
 def caution_for(
     machine: Machine, options: Options, shaper: BestShaper, directory: Path, dt_s: float
 ) -> tuple[Caution, Choice] | None:
-    """Return the default's share of the shaper, and why; None without a shaper."""
+    """Return the mixture for `robust=auto` and the reason; None where no shaper is mixed in."""
     if options.vibration != "fbf" or options.robust != "auto":
         return None
     measured = any(map(measured_set, machine.axes.values()))
-    # Who knows how a resonance moves during a print knows more of it than where it is.
+    # A schedule of the resonance means that more is known than its typed-in frequency.
     stated = not machine.schedules and any(map(stated_hz, machine.axes.values()))
     if not measured and not stated:
         return None
@@ -179,7 +179,7 @@ def caution_for(
 
 
 def stated_note(machine: Machine, shaper: BestShaper) -> str | None:
-    """Say what a resonance that was only typed in is good for."""
+    """Return a note on what a typed-in resonance is good for; None if both axes were measured."""
     typed = [axis.upper() for axis in ("x", "y") if stated_hz(machine.axes[axis]) is not None]
     if not typed:
         return None
@@ -192,7 +192,7 @@ def stated_note(machine: Machine, shaper: BestShaper) -> str | None:
 
 
 def prediction_note(machine: Machine, choice: Choice) -> str:
-    """Return a note on what a report predicts, and how far its plants differ."""
+    """Return a note on the plants behind the predictions, and how far they differ."""
     measured = []
     for axis, plants in sorted(machine.axes.items()):
         about = plants.provenance
@@ -217,9 +217,9 @@ def choose_caution(
     ----------
     machine : Machine
     shaper : BestShaper
-        What the nominal plants lead to.
+        Tuned for the nominal plants.
     directory : Path
-        Where the choice is kept.
+        Cache of the choices.
     dt_s : float
         Sampling time of the commands.
     basis : str
@@ -233,15 +233,15 @@ def choose_caution(
     )
 
 
-def _read(found: dict[str, Any]) -> Choice:
-    ranges = {name: (low, high) for name, (low, high) in found["ranges"].items()}
-    return Choice(**{**found, "shares": tuple(found["shares"]), "ranges": ranges})
+def _read(document: dict[str, Any]) -> Choice:
+    ranges = {name: (low, high) for name, (low, high) in document["ranges"].items()}
+    return Choice(**{**document, "shares": tuple(document["shares"]), "ranges": ranges})
 
 
 def _tried(machine: Machine, shaper: BestShaper, dt_s: float, basis: str) -> Choice:
     path, extruding = reference_motion_of(machine, dt_s)
-    most = [most_share(machine.axes[axis]) for axis in ("x", "y")]
-    commands = _commands(machine, shaper, basis, dt_s, fbf=any(most))
+    most_shares = [most_share(machine.axes[axis]) for axis in ("x", "y")]
+    commands = _commands(machine, shaper, basis, dt_s, fbf=any(most_shares))
     at = np.flatnonzero(extruding).astype(np.int64)[::_STRIDE]
     distances = PathDistances(path, dt_s)
     answers = [
@@ -257,7 +257,7 @@ def _tried(machine: Machine, shaper: BestShaper, dt_s: float, basis: str) -> Cho
     shaped = np.array([rms(smooth_mm) for _, smooth_mm, _ in answers])
     none = np.array([rms(none_mm) for _, _, none_mm in answers])
 
-    def tried(shares: tuple[float, float]) -> Choice:
+    def evaluate(shares: tuple[float, float]) -> Choice:
         a = np.array(shares)[:, None]
         ours = np.array(
             [rms(a * exact_mm + (1 - a) * smooth_mm) for exact_mm, smooth_mm, _ in answers]
@@ -271,13 +271,15 @@ def _tried(machine: Machine, shaper: BestShaper, dt_s: float, basis: str) -> Cho
             float(1e3 * np.exp(weights @ np.log(np.maximum(ours, 1e-12)))),
         )
 
-    both = [tried((min(share, most[0]), min(share, most[1]))) for share in _SHARES]
-    best = min(both, key=_rank)
+    mixtures = [
+        evaluate((min(share, most_shares[0]), min(share, most_shares[1]))) for share in _SHARES
+    ]
+    best = min(mixtures, key=_rank)
     for i in (0, 1):
         others = [
-            tried((share, best.shares[1]) if i == 0 else (best.shares[0], share))
+            evaluate((share, best.shares[1]) if i == 0 else (best.shares[0], share))
             for share in _SHARES
-            if share <= most[i]
+            if share <= most_shares[i]
         ]
         best = min([best, *others], key=_rank)
     a = np.array(best.shares)[:, None]
@@ -298,7 +300,7 @@ def _tried(machine: Machine, shaper: BestShaper, dt_s: float, basis: str) -> Cho
 
 
 def _nominal(machine: Machine, command: Array, dt_s: float) -> Array:
-    """Return what the nominal plants make of a command, dry friction included."""
+    """Return the nominal plants' response to a command, dry friction included."""
     pair = [plant_set(machine.axes[axis], dt_s).nominal for axis in ("x", "y")]
     return response(pair, _received(machine, command))
 
@@ -308,7 +310,7 @@ def _commands(
 ) -> tuple[Array, Array]:
     """Return the commands of filtered basis functions and of the shaper on the reference motion.
 
-    Where the shaper alone comes into question (not `fbf`), it is both.
+    Without `fbf`, both are the shaper's.
     """
     path, extruding = reference_motion_of(machine, dt_s)
     smooth = ShaperCompensator(
@@ -326,14 +328,14 @@ def _commands(
 def _strong(machine: Machine) -> Machine:
     """Return the machine with at least the default limits of the command.
 
-    The choice depends on how well the plants are known. What the motors allow is checked for every
+    The choice depends on how well the plants are known; the motors' limits are checked for every
     piece of a print (`compensation.cautious`).
     """
-    usual, own = CommandLimits(), machine.command
-    command = usual.model_copy(
+    default, own = CommandLimits(), machine.command
+    command = default.model_copy(
         update={
-            "velocity_mm_s": max(usual.velocity_mm_s, own.velocity_mm_s),
-            "accel_mm_s2": max(usual.accel_mm_s2, own.accel_mm_s2),
+            "velocity_mm_s": max(default.velocity_mm_s, own.velocity_mm_s),
+            "accel_mm_s2": max(default.accel_mm_s2, own.accel_mm_s2),
         }
     )
     return machine.model_copy(update={"command": command})
@@ -344,47 +346,47 @@ def error_ranges(
 ) -> dict[str, tuple[float, float]]:
     """Return least and largest error of the members relative to the nominal plants', by command.
 
-    Where friction is known it differs from member to member too, and so does the delay of one axis
-    against the other, which alignment cannot see.
+    Known friction varies between the members too, and so does the delay between the axes, which
+    alignment cannot see.
 
     Parameters
     ----------
     commands : dict of str to ndarray, shape (2, n)
     rms : callable
-        From positions (2, n) to their error.
+        Maps positions (2, n) to their rms error.
     """
     x, y = (plant_set(machine.axes[axis], dt_s) for axis in ("x", "y"))
     pairs = _side_by_side(x.members, y.members)
     sides = np.where(np.arange(len(pairs)) % 2, 1.0, -1.0)
-    # A set of plants without measured phase holds delays of its own.
+    # Sets without measured phase already include delays.
     lag_s = 0.0 if any(map(_unseen, machine.axes.values())) else _LAG_UNSURE_S
     out = {}
     for name, command in commands.items():
-        usual = max(rms(_nominal(machine, command, dt_s)), 1e-12)
-        found = []
+        nominal = max(rms(_nominal(machine, command, dt_s)), 1e-12)
+        ratios = []
         for pair, side in zip(pairs, sides, strict=True):
             received = _received(machine, command, 1.0 + _FRICTION_UNSURE * side)
-            found.append(rms(_delayed(response(pair, received), side * lag_s / dt_s)) / usual)
-        out[name] = (min(1.0, *found), max(1.0, *found))
+            ratios.append(rms(_delayed(response(pair, received), side * lag_s / dt_s)) / nominal)
+        out[name] = (min(1.0, *ratios), max(1.0, *ratios))
     return out
 
 
 def _received(machine: Machine, command: Array, share: float = 1.0) -> Array:
-    """Return what dry friction leaves of a command; `share` scales the measured friction."""
+    """Return a command after dry friction; `share` scales the measured friction."""
     return DryFriction([share * held for held in machine.friction_mm]).received_mm(command)
 
 
 def _delayed(y: Array, samples: float) -> Array:
     """Return a motion (2, n) with X delayed by `samples`; if negative, Y is delayed instead."""
     row = 0 if samples > 0.0 else 1
-    late = y.copy()
+    delayed = y.copy()
     at = np.arange(y.shape[1], dtype=float)
-    late[row] = np.interp(at - abs(samples), at, y[row])
-    return late
+    delayed[row] = np.interp(at - abs(samples), at, y[row])
+    return delayed
 
 
 def _rank(choice: Choice) -> float:
-    """Rank choices, the best lowest: the mean over likely members, and the worst one's excess."""
+    """Return the cost of a choice: the mean over likely members plus the worst one's excess."""
     return choice.mean + _PRICE * max(0.0, choice.worst - 1.0)
 
 
@@ -396,7 +398,7 @@ def most_share(axis: PlantSetSpec) -> float:
 
 
 def _unseen(axis: PlantSetSpec) -> bool:
-    """Whether the phase of an axis was not measured."""
+    """Return whether the phase of an axis is unmeasured."""
     about = axis.provenance
     return about is None or about.magnitude_only or stated_hz(axis) is not None
 
@@ -404,8 +406,8 @@ def _unseen(axis: PlantSetSpec) -> bool:
 def pair_weights(machine: Machine, count: int) -> Array:
     """Return the weight of each pair: the geometric mean of its members' weights, normalised.
 
-    Members are paired by their place in the sets, so this is no joint probability: the root keeps
-    one unlikely member from hiding the other.
+    Members are paired by their place in the sets, so this is no joint probability: with the root,
+    an unlikely member of one axis does not suppress its partner.
     """
     x, y = (
         np.array([m.weight for m in machine.axes[axis].weighted_members()]) for axis in ("x", "y")
@@ -415,12 +417,12 @@ def pair_weights(machine: Machine, count: int) -> Array:
 
 
 def member_pairs(machine: Machine, dt_s: float) -> list[Pair]:
-    """Return members of X and Y side by side, slow motion on time."""
-    # A delay that differs between the axes spoils all commands alike: it tells none from another.
+    """Return members of X and Y in pairs, without their delays."""
+    # A delay between the axes adds the same error to all commands: it cannot rank them.
     axes = [machine.axes[axis].without_delay() for axis in ("x", "y")]
     return _side_by_side(*(plant_set(axis, dt_s).members for axis in axes))
 
 
 def _side_by_side(x: Sequence[DiscretePlant], y: Sequence[DiscretePlant]) -> list[Pair]:
-    """Return pairs of members; the shorter list again from its start."""
+    """Return pairs of members; the shorter list repeats."""
     return [(x[j % len(x)], y[j % len(y)]) for j in range(max(len(x), len(y)))]

@@ -1,4 +1,4 @@
-"""CPU seconds by stage."""
+"""Measure CPU time by stage."""
 
 from __future__ import annotations
 

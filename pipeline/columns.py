@@ -1,4 +1,4 @@
-"""Tables with one row per sample, written as they arrive: NumPy's npz, or CSV."""
+"""Write tables with one row per sample incrementally, as npz or CSV."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ __all__ = ["Table", "csv_table", "npz_table"]
 
 
 class Table(Protocol):
-    """Takes rows."""
+    """A table that takes rows."""
 
     def write(self, columns: Mapping[str, np.ndarray]) -> None:
         """Add rows: arrays of one length by name, the same names in the same order every time."""
 
     def clear(self) -> None:
-        """Take all rows back."""
+        """Remove all rows."""
 
 
 @contextlib.contextmanager
@@ -34,7 +34,7 @@ def npz_table(target: Path, types: Mapping[str, str]) -> Iterator[Table]:
     Parameters
     ----------
     target : Path
-        Columns wait in unnamed files beside it.
+        Columns are buffered in unnamed files beside it.
     types : mapping
         Names of the columns and their types, as ``<f8``.
     """
@@ -46,7 +46,7 @@ def npz_table(target: Path, types: Mapping[str, str]) -> Iterator[Table]:
         yield table
         with zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
             for name, column in columns.items():
-                # A date of its own would make equal tables unequal files.
+                # ZipInfo's fixed date keeps equal tables byte-identical.
                 entry = zipfile.ZipInfo(f"{name}.npy")
                 with archive.open(entry, "w", force_zip64=True) as out:
                     header = {"descr": types[name], "fortran_order": False, "shape": (table.rows,)}

@@ -1,7 +1,7 @@
 """The pipeline: a print file in, a compensated and verified file out, in bounded memory.
 
-A job (`pipeline.job`) writes the file once. It is run again, with less, where what it wrote is too
-large, exceeds a budget, or is refused by the last check.
+A job (`pipeline.job`) writes the file once. It is run again with less compensation or speed where
+the file is too large, exceeds a budget, or is refused by the last check.
 """
 
 from __future__ import annotations
@@ -52,12 +52,12 @@ def compensate_file(
     cache_dir : Path, optional
         Where the tuned shaper of a machine revision is kept.
     progress : callable, optional
-        Called now and then; may raise `Cancelled`.
+        Called from time to time; may raise `Cancelled`.
     layers : Path, optional
         Folder for layers.json and layers.bin (`pipeline.measuring.layer_files`).
     trace : callable, optional
-        Is given the motion as it is measured; once more from its first sample where the last check
-        has a piece reverted.
+        Receives the motion as it is measured; again from the first sample if the last check
+        reverts a piece.
 
     Raises
     ------
@@ -81,7 +81,7 @@ def compensate_file(
 
         result = advise_file(source, target, machine, options, **how, layers=layers)
     else:
-        # First, as the target may be the source.
+        # Before rewriting: the target may be the source.
         live = predict_live(source, machine, options, **how) if options.compare_live else None
         order = Order(machine, options, cache_dir, progress)
         result = _rewrite(source, target, order, layers, trace)
@@ -114,11 +114,11 @@ def _final_job(
     name: str,
     trace: Callable[[Trace], None] | None,
 ) -> tuple[Job, Result]:
-    """Run jobs until what one writes fits, keeps the budget and passes the check; return that one.
+    """Run jobs until the file fits, keeps the budget and passes the check; return that job.
 
-    A piece that the last check refuses stays as sliced, as one that any other check refuses.
+    A piece that the last check refuses stays as sliced, like one that any other check refuses.
     """
-    # Within a budget a file may be written more than once: only the last time is traced.
+    # With a budget a file may be written several times: only the last one is traced.
     again = order.options.paced or order.options.max_mb is not None
     traced = None if again else trace
     budget: SpeedBudget | None = None
@@ -138,7 +138,7 @@ def _final_job(
             budget = budget and budget.again()
         else:
             if gentler is None:
-                traced = trace  # the file is good: once more as it is, for the trace
+                traced = trace  # accepted: repeat it unchanged for the trace
             budget = gentler or job.same
         file.spool.seek(0)
         file.spool.truncate()
@@ -146,7 +146,7 @@ def _final_job(
 
 
 def _fitting(options: Options, name: str) -> Options:
-    """Return options for a smaller file than those that made one too large."""
+    """Return options that write a smaller file."""
     if options.method == "none":
         raise GcodeError(
             f"{name} exceeds max_mb {options.max_mb:g}, and method none writes it as sliced: "

@@ -14,20 +14,20 @@ from stillpath.models.machine import Machine
 __all__ = ["LengthGuard"]
 
 LOOK_AHEAD_S = 48 * 3600.0
-"""From here on the rest of the file is planned before anything else: planning costs time per line,
-all else per second of the print, and a single line may last twenty minutes."""
+"""After this print time the rest of the file is planned first: planning costs time per line, all
+else per second of the print, and a single line may last twenty minutes."""
 
 
 class LengthGuard:
-    """Watch how long a print becomes.
+    """Check the print time as a file is read.
 
     Parameters
     ----------
     text : binary file
-        The print; its place is kept.
+        The print; its position is preserved.
     machine : Machine
     dialect : Dialect
-        How the file is read.
+        Dialect of the file.
     """
 
     def __init__(self, text: BinaryIO, machine: Machine, dialect: Dialect) -> None:

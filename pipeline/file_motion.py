@@ -31,16 +31,16 @@ from stillpath.pipeline.reading import dialect_for, doubts, passed_over
 __all__ = ["STANDING_S", "FileMotion", "MotionPart", "TextMotion"]
 
 STANDING_S = 2.0
-"""How long a stand is measured: all vibration has died down after that."""
+"""Measured part of a standstill: after it all vibration has died down."""
 
 
 @dataclass(frozen=True, slots=True)
 class MotionPart:
     """Samples with the moves they belong to.
 
-    `path_mm`, shape (2, n), is where the file wants X and Y, if the firmware rounds to motor steps.
-    `jumped`: the position was lost before them. `shaping`: what the file has set the firmware's
-    shaper to.
+    `path_mm`, shape (2, n), is the path in the file, given if the firmware rounds to motor steps.
+    `jumped`: the position was lost before these samples. `shaping`: the firmware's shaper as set
+    by the file.
     """
 
     samples: Samples
@@ -82,21 +82,21 @@ class TextMotion:
     dialect : Dialect
     dt_s : float
     longest_stand_s : float
-        What the machine stands longer is left out of the samples.
+        Longer standstills are cut to this.
     shaping : Shaping
         The firmware's shaper before the first line.
     progress : callable, optional
-        Is given the share of the file that is read and the time that it takes, now and then.
+        Receives the share of the file read so far and its print time, from time to time.
     each : callable, optional
-        Is given every block of the program before its motion.
+        Receives every block of the program before its motion.
 
     Attributes
     ----------
     time_s : float
-        Time of the motion that is planned.
+        Duration of the motion planned so far.
     reader : Interpreter
     shapers : list of str
-        Labels of the shapers that the file sets, each once.
+        Labels of the shapers set by the file, without repeats.
     """
 
     def __init__(
@@ -117,10 +117,10 @@ class TextMotion:
         self._left_out_s = self._end_s = 0.0
         self._held: list[tuple[int, Moves]] = []
         self._jumps: list[int] = []
-        """Moves in front of which the position was lost, by their index in the file."""
+        """Indices in the file of the moves before which the position was lost."""
         self._shaping = self._read_shaping = shaping
         self._changes: list[tuple[int, Shaping]] = []
-        """Moves in front of which the shaper was set, and to what."""
+        """Indices of the moves before which the shaper was set, and the shaper."""
         self._step_mm = adapter(machine).step_mm
         self._sampler, self._path_sampler = Sampler(dt_s), Sampler(dt_s)
         self._adviser = adapter(machine).adviser(dialect)
@@ -131,7 +131,7 @@ class TextMotion:
 
     @property
     def warnings(self) -> list[str]:
-        """Commands that the firmware skips, or that are not modelled."""
+        """Return warnings about commands that the firmware skips, or that are not modelled."""
         return [*passed_over(self.reader), *sorted(self._unmodelled)]
 
     def __iter__(self) -> Iterator[MotionPart]:
@@ -197,7 +197,7 @@ class TextMotion:
         return int(moves.line[move_index - first])
 
     def _shortened(self, phases: Phases) -> Phases:
-        """Shorten stands to the longest that is measured."""
+        """Shorten standstills to the longest that is measured."""
         if len(phases) == 0 or np.isinf(self._longest_stand_s):
             return phases
         end_s = phases.end_s
@@ -209,7 +209,7 @@ class TextMotion:
     def _sampled(
         self, phases: Phases, *, final: bool
     ) -> Iterator[tuple[Samples, np.ndarray | None]]:
-        """Sample motion, and where the file wants it, if the firmware rounds to motor steps."""
+        """Sample the motion, and the path in the file if the firmware rounds to motor steps."""
         if max(self._step_mm[:2]) == 0.0:
             for samples in _all(self._sampler, phases, final=final):
                 yield samples, None
@@ -227,7 +227,7 @@ class TextMotion:
             yield samples, path.xyz_mm[:2]
 
     def _parts(self, samples: Samples, path_mm: np.ndarray | None) -> Iterator[MotionPart]:
-        """Cut samples where the position is lost or the shaper changes between two moves."""
+        """Split samples where the position is lost or the shaper changes."""
         begun, jumped, last = 0, False, int(samples.move_index[-1])
         while True:
             jump = self._jumps[0] if self._jumps else last + 1

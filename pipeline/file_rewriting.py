@@ -22,19 +22,19 @@ __all__ = ["FileRewriting", "file_rewriting"]
 
 @dataclass(slots=True)
 class FileRewriting:
-    """A file being rewritten, and the files for it.
+    """The open files of a rewrite.
 
     Attributes
     ----------
     container : Container
         The file as it is, its G-code in `text`.
     text : binary file
-        Takes the new G-code.
+        Receives the new G-code.
     spool : binary file
-        Seekable: what is written before its times are known.
+        Seekable; holds the new G-code until its times are known.
     layers : LayerWriter, optional
     sizes : dict
-        Fields of a `Result`: bytes of both files; filled when the new one is complete.
+        File size fields of a `Result`; filled when the new file is complete.
     """
 
     container: Container
@@ -53,7 +53,7 @@ def file_rewriting(
     layers: Path | None,
     progress: ProgressCallback | None,
 ) -> Iterator[FileRewriting]:
-    """Open what a rewrite needs; the target and the folder of layers appear at the end.
+    """Open the files of a rewrite; target and layers are put in place at the end.
 
     Raises
     ------

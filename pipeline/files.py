@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all, and what is kept between jobs."""
+"""Atomic writing of files, and the cache that is kept between jobs."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ __all__ = ["Discarding", "default_cache_dir", "kept", "replacing"]
 T = TypeVar("T")
 
 _NAME_PART = 40
-"""Characters of a name that its temporary file carries on; names have at most 255 bytes."""
+"""Characters of the target's name in that of its temporary file (names: 255 bytes at most)."""
 
 
 class Discarding:
-    """A file to write to that keeps nothing."""
+    """A file that discards what is written to it."""
 
     def write(self, data: bytes) -> int:
-        """Take bytes; return how many."""
+        """Discard bytes; return how many."""
         return len(data)
 
 
@@ -34,14 +34,14 @@ class Discarding:
 def replacing(target: Path) -> Iterator[Path]:
     """Yield a temporary file beside `target` that takes its place when the block ends well.
 
-    On Linux it has no name until it is complete, and nothing is left of a process that is killed:
-    its path leads there through ``/proc``. Elsewhere a hidden ``.part`` file may be left.
+    On Linux the file has no name until it is complete (the path goes through ``/proc``), so that a
+    killed process leaves nothing behind. Elsewhere a hidden ``.part`` file may remain.
 
     Raises
     ------
     OSError
-        The folder or the disk does not take it; or `target` is a device or a pipe, which must not
-        be replaced by a file.
+        The folder or disk refuses it, or `target` is a device or a pipe, which must not be
+        replaced by a file.
     """
     if target.exists() and not target.is_file():
         raise OSError(errno.EINVAL, "is not a regular file; name one to write", str(target))
@@ -52,16 +52,16 @@ def replacing(target: Path) -> Iterator[Path]:
         mode = target.stat().st_mode if target.exists() else 0o666 & ~_umask()
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())
-        with contextlib.suppress(OSError):  # file systems of memory cards know no modes
+        with contextlib.suppress(OSError):  # file systems of memory cards have no modes
             temporary.chmod(mode & 0o7777)
         if handle is not None:
             temporary = _link(handle, target)
         temporary.replace(target)
     except BaseException as error:
-        with contextlib.suppress(OSError):  # what has no name cannot be removed, and need not be
+        with contextlib.suppress(OSError):  # an unnamed file cannot and need not be removed
             temporary.unlink(missing_ok=True)
         if isinstance(error, OSError) and error.filename is None:
-            error.filename = str(target)  # a full disk does not say which
+            error.filename = str(target)  # errors of a full disk carry no name
         raise
     finally:
         if handle is not None:
@@ -80,7 +80,7 @@ def _named(target: Path) -> Path:
 
 
 def _open_unnamed(folder: Path) -> int | None:
-    """Open a file without a name; None where the system or the file system has none."""
+    """Open a file without a name; None where that is not supported."""
     if sys.platform != "linux":
         return None
     try:
@@ -98,9 +98,9 @@ def _path_of(handle: int) -> Path:
 
 
 def _link(handle: int, target: Path) -> Path:
-    """Give an unnamed file a name beside `target`: a link cannot replace an existing file."""
+    """Link an unnamed file beside `target`, as a link cannot replace an existing file."""
     name = target.with_name(f".{target.name[:_NAME_PART]}.{secrets.token_hex(4)}.part")
-    # With a folder's handle, which an absolute path does not use, Python follows links.
+    # Python follows links only if given a directory handle, which absolute paths ignore.
     os.link(_path_of(handle), name, src_dir_fd=handle, follow_symlinks=True)
     return name
 
@@ -116,7 +116,7 @@ def kept(path: Path, read: Callable[[Any], T], make: Callable[[], T]) -> T:
         Turns the JSON document into the value; raises ValueError, TypeError or KeyError if it
         cannot.
     make : callable
-        Makes the value, a dataclass of numbers, texts and arrays.
+        Makes the value, a dataclass of numbers, strings and arrays.
 
     Raises
     ------

@@ -2,8 +2,8 @@
 
 A file is read block by block, cut into pieces and verbatim parts, and written in order. Every piece
 that was changed is read back from the bytes as written, planned by the firmware's rules and
-compared with what it should do; a piece that fails is written as sliced. All figures come from that
-motion.
+compared with its command; a piece that fails is written as sliced. All figures come from the motion
+that was read back.
 """
 
 from __future__ import annotations
@@ -70,9 +70,9 @@ if TYPE_CHECKING:
 __all__ = ["Attempt", "Job"]
 
 _SAID = (Unfit, GcodeError, DesignError, ModelError)
-"""Errors whose message says why a piece cannot be compensated."""
+"""Errors whose message tells the user why a piece cannot be compensated."""
 _FAULTS = (*_SAID, ArithmeticError, AssertionError, LookupError, TypeError, ValueError)
-"""These and errors of ours: the piece concerned stays as sliced, the others are compensated."""
+"""These and our own bugs: only the piece concerned stays as sliced."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +89,7 @@ class Attempt:
 class Job:
     """One run of the pipeline over one file.
 
-    What is written waits in `target` until its times are known; `retiming` then copies it.
+    The text stays in `target` until its times are known; `retiming` then copies it.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ class Job:
     trace : callable, optional
         Is given the motion as it is measured.
     budget : SpeedBudget, optional
-        Paces chosen by an earlier run; None: they are chosen here, if the options have a budget.
+        Paces from an earlier run; None: chosen here if the options have a budget.
 
     Attributes
     ----------
@@ -161,7 +161,7 @@ class Job:
     def _design(self, cache_dir: Path) -> None:
         """Tune the reference shaper and design the command."""
         machine, options = self._machine, self._options
-        # A method that cannot be designed says so before the reference shaper takes its seconds.
+        # Design first: a design error should show before the slow tuning of the shaper.
         tuned_first = options.method.startswith("shaper:")
         if self._changes and not tuned_first:
             self._say("designing", 0.0)
@@ -178,24 +178,24 @@ class Job:
 
     @property
     def _pairs(self) -> BudgetMeasurement | None:
-        """The measurement, where it is one of both paces."""
+        """The measurement, if it compares both paces; else None."""
         return self._measurement if isinstance(self._measurement, BudgetMeasurement) else None
 
     @property
     def gentler(self) -> SpeedBudget | None:
-        """What the file must be written with instead, where it exceeds its budget."""
+        """Return a gentler budget if the written file exceeds its own; else None."""
         if self._budget is None or self._pairs is None:
             return None
         return self._budget.gentler(self._pairs.sums())
 
     @property
     def same(self) -> SpeedBudget | None:
-        """What the file was written with."""
+        """Return the budget with which the file was written."""
         return self._budget.again() if self._budget is not None else None
 
     @property
     def delay_s(self) -> float:
-        """How much later than the original the written file is at the current place."""
+        """Delay of the written file against the original at the current place."""
         return self._sum.time_s - self._sum.original_s
 
     def run(self, name: str, facts: SlicerFacts) -> Result:
@@ -230,7 +230,7 @@ class Job:
         return self._summary().result(name, size, facts, self._clock)
 
     def checked(self, result: Result) -> Result:
-        """Compare the file as it will be delivered with the original.
+        """Compare the file to be delivered with the original.
 
         Raises
         ------
@@ -255,7 +255,7 @@ class Job:
         self.retiming.copy(self._target, text, self.delay_s)
 
     def _chosen_paces(self, size: int) -> SpeedBudget:
-        """Find how quick the print may be."""
+        """Choose the paces of the print."""
         self._source.seek(0)
         with self._clock.stage("budget"):
             found = take_samples(
@@ -286,7 +286,7 @@ class Job:
         paces = iter((piece,)) if self._budget is None else self._budget.paced(piece)
         refusal = self._order.refusal(*lines)
         if refusal is not None:
-            next(paces)  # which counts what it takes with the shaper
+            next(paces)  # counts the time with the shaper
             self._put_back(piece, refusal)
             return
         self._motion.begin(piece)
@@ -297,7 +297,7 @@ class Job:
                 break
             except Unfit as error:
                 reason = str(error)
-            except GcodeError as error:  # its line is one of what was written
+            except GcodeError as error:  # its line number is of the written text
                 reason = f"the firmware would refuse the compensated lines: {error.message}"
         else:
             self._sum.time_s -= switched_s
@@ -320,9 +320,9 @@ class Job:
         self._emit(attempt.text, piece, np.append(delay_s + late_s, self.delay_s))
 
     def _switched_off_s(self) -> float:
-        """Stand still where a piece that comes now begins with a line that makes the machine stand.
+        """Count how long the machine stands while its shaper is switched off, and return it.
 
-        Before it is compensated: vibration dies down meanwhile.
+        This precedes the compensation of the piece: vibration dies down meanwhile.
         """
         lines = self._writer.switching_off
         seconds = switching_s(self._checker.snapshot().push(lines)) if lines else 0.0
@@ -336,7 +336,7 @@ class Job:
         Parameters
         ----------
         piece, paced : Piece
-            As it came, and as its moves are planned now.
+            As sliced, and as planned at the new pace.
         """
         writer, checker = copy.copy(self._writer), None
         try:
@@ -366,7 +366,7 @@ class Job:
         return Attempt(made, executed, gap_mm, text, motion)
 
     def _put_back(self, piece: Piece, reason: str) -> None:
-        """Let a piece stay as sliced; what it was counted for is taken back."""
+        """Write a piece as sliced and undo what was counted for it."""
         phases, seconds = piece.phases, piece.phases.duration_s
         extruding_s = float(np.sum(phases.lasts_s[phases.prints]))
         self._sum.put_back.append(
@@ -390,7 +390,7 @@ class Job:
             text = self._writer.verbatim(verbatim, self._checker.extruder_mm)
             with self._clock.stage("read back"):
                 blocks = self._checker.push(text)
-            # Lines of ours make it stand too, or its own longer than they did.
+            # Our own lines can also add standstill, or lengthen the file's.
             self._motion.wait(switching_s(blocks) - switching_s([verbatim]))
         self._emit(text, verbatim, self.delay_s)
         self._sum.moves += len(verbatim.moves)

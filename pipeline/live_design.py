@@ -1,8 +1,8 @@
 """Choose a machine's filter for live printing, and predict its errors over the plant set.
 
-Filters of several bandwidths, each mixed with some of the best shaper, are tried on the reference
-motion. Of those that are no worse than the shaper for any member, the one that is best for the
-likely members is taken. The shaper is such a filter too, and always among the candidates.
+Filters of several bandwidths, each mixed with the best shaper in several shares, are tried on the
+reference motion. Of those no worse than the shaper for any member, the best for the likely members
+is chosen. The shaper itself is always among the candidates.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ _VERSION = 3
 """Part of the cache's name; rises when the design changes."""
 _CORNERS_HZ = (70.0, 90.0, 115.0, 150.0, 200.0, 270.0)
 _REACHES = (80, 160)
-"""Samples on either side; the longer one is for axes whose slowest mode rings below 25 Hz or so."""
+"""Samples on either side; the longer one serves axes with a mode below about 25 Hz."""
 _SHARES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.2, 0.0)
 _STRIDE, _NOTHING = 5, 1e-12
 _AS_GOOD, _AS_SHARP = 1.05, 1.02
-"""Ratios to the least error. The shortest filter within the first is taken, and of that length the
-one with the least bandwidth within the second: it asks for less acceleration."""
+"""Ratios to the least error. The shortest filter within the first is chosen, and of that length the
+one of least bandwidth within the second, which needs less acceleration."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,9 +59,9 @@ class LiveDesign:
     ----------
     taps : ndarray, shape (2, n)
     shares : (float, float)
-        Of the filter in the taps of X and Y; the rest is the shaper.
+        Share of the filter in the taps of X and Y; the rest is the shaper.
     corner_hz : float
-        Its bandwidth.
+        Bandwidth of the filter.
     shaper : BestShaper
     worst, mean : float
         Largest and geometric mean over the members of the contour error against the shaper's.
@@ -69,7 +69,7 @@ class LiveDesign:
         By channel (before, live, shaper): nominal contour error rms on the reference motion, and
         least and largest over the members.
     peak_accel_mm_s2 : float
-        Of the command of an axis on the reference motion.
+        Of an axis of the command on the reference motion.
     """
 
     taps: Array
@@ -82,7 +82,7 @@ class LiveDesign:
     peak_accel_mm_s2: float
 
     def accel_gain(self, axis: int) -> float:
-        """Return how many times the plan's acceleration the command's can be: sum |taps|."""
+        """Return the largest ratio of the command's acceleration to the plan's: sum |taps|."""
         return float(np.abs(self.taps[axis]).sum())
 
     def ranged(self, channel: Channel, machine: Machine) -> Channel:
@@ -115,7 +115,7 @@ def design_live(machine: Machine, shaper: BestShaper) -> LiveDesign:
     Parameters
     ----------
     shaper : BestShaper
-        What the nominal plants lead to, tuned on the same motion.
+        Tuned for the nominal plants on the same motion.
 
     Raises
     ------
@@ -127,10 +127,9 @@ def design_live(machine: Machine, shaper: BestShaper) -> LiveDesign:
 
 
 def cached_live_design(machine: Machine, directory: Path) -> LiveDesign:
-    """Return the filter of a machine, designed once per machine revision, which takes seconds.
+    """Return the filter of a machine, designed once per machine revision (this takes seconds).
 
-    It is a JSON file in `directory`, written whole or not at all. A file that cannot be read is
-    made again.
+    It is cached as a JSON file in `directory`; an unreadable file is made again.
 
     Raises
     ------
@@ -158,7 +157,7 @@ def _read(found: dict[str, Any]) -> LiveDesign:
 
 @dataclass(frozen=True, slots=True)
 class _Candidate:
-    """A filter, and its contour error against the shaper's, geometric mean over the members."""
+    """A filter, and the geometric mean over the members of its error relative to the shaper's."""
 
     ratio: float
     corner_hz: float
@@ -167,7 +166,7 @@ class _Candidate:
 
 
 class _Trial:
-    """Filters on the reference motion, answered by every member."""
+    """Responses of every member to filters on the reference motion."""
 
     def __init__(self, machine: Machine, shaper: BestShaper) -> None:
         self._machine, self._shaper = machine, shaper
@@ -184,32 +183,32 @@ class _Trial:
         self._shaped = np.array([self._rms(y) for y in self._smooth_mm])
 
     def chosen(self) -> LiveDesign:
-        """Return the best that keeps the promise."""
-        found = list(self._candidates())
-        least = min(one.ratio for one in found)
-        length = min(one.taps.shape[1] for one in found if one.ratio <= _AS_GOOD * least)
-        short = [one for one in found if one.taps.shape[1] == length]
+        """Return the best candidate (see the module's description)."""
+        candidates = list(self._candidates())
+        least = min(one.ratio for one in candidates)
+        length = min(one.taps.shape[1] for one in candidates if one.ratio <= _AS_GOOD * least)
+        short = [one for one in candidates if one.taps.shape[1] == length]
         least = min(one.ratio for one in short)
-        good = [one for one in short if one.ratio <= _AS_SHARP * least]
-        best = min(good, key=lambda one: (one.corner_hz, one.ratio))
+        accurate = [one for one in short if one.ratio <= _AS_SHARP * least]
+        best = min(accurate, key=lambda one: (one.corner_hz, one.ratio))
         command = self._command(best.taps)
-        ours = np.array([self._rms(y) for y in self._answers(command)])
+        errors = np.array([self._rms(y) for y in self._answers(command)])
         channels = {"before": self._path, "live": command, "shaper": self._smooth}
         return LiveDesign(
             best.taps,
             best.shares,
             best.corner_hz,
             self._shaper,
-            float((ours / self._shaped).max()),
-            float(np.exp(self._weights @ np.log(ours / self._shaped))),
+            float((errors / self._shaped).max()),
+            float(np.exp(self._weights @ np.log(errors / self._shaped))),
             self._figures(channels),
             _peak(command),
         )
 
     def _candidates(self) -> Iterator[_Candidate]:
-        """Yield what keeps promise and limits; the shaper first."""
+        """Yield the shaper, then filters within the limits that are no worse for any member."""
         sets = [plant_set(self._machine.axes[a].without_delay(), DT_S) for a in ("x", "y")]
-        most = [most_share(self._machine.axes[a]) for a in ("x", "y")]
+        most_shares = [most_share(self._machine.axes[a]) for a in ("x", "y")]
         yield _Candidate(1.0, 0.0, _shortened(self._smooth_taps), (0.0, 0.0))
         for reach, corner_hz in itertools.product(_REACHES, _CORNERS_HZ):
             exact = np.stack([design_taps(s.members, s.weights, corner_hz, reach) for s in sets])
@@ -217,29 +216,29 @@ class _Trial:
             if _peak(command) > self._machine.command.accel_mm_s2:
                 continue
             exact_mm = self._answers(command)
-            tried: dict[tuple[float, float], float] = {}
+            ratios: dict[tuple[float, float], float] = {}
             for share in _SHARES:
-                both = (min(share, most[0]), min(share, most[1]))
-                tried[both] = self._ratio(exact_mm, both)
+                both = (min(share, most_shares[0]), min(share, most_shares[1]))
+                ratios[both] = self._ratio(exact_mm, both)
             for axis in (0, 1):
-                best = min(tried, key=tried.__getitem__)
+                best = min(ratios, key=ratios.__getitem__)
                 for share in _SHARES:
                     one = (share, best[1]) if axis == 0 else (best[0], share)
-                    if share <= most[axis] and one not in tried:
-                        tried[one] = self._ratio(exact_mm, one)
-            shares = min(tried, key=tried.__getitem__)
-            if shares != (0.0, 0.0) and np.isfinite(tried[shares]):
-                yield _Candidate(tried[shares], corner_hz, self._mixed(exact, shares), shares)
+                    if share <= most_shares[axis] and one not in ratios:
+                        ratios[one] = self._ratio(exact_mm, one)
+            shares = min(ratios, key=ratios.__getitem__)
+            if shares != (0.0, 0.0) and np.isfinite(ratios[shares]):
+                yield _Candidate(ratios[shares], corner_hz, self._mixed(exact, shares), shares)
 
     def _mixed(self, exact: Array, shares: tuple[float, float]) -> Array:
-        """Return taps with some of the shaper's, as long as either needs."""
+        """Return the taps mixed with the shaper's."""
         a = np.array(shares)[:, None]
-        more = (self._smooth_taps.shape[1] - exact.shape[1]) // 2
-        exact = np.pad(exact, ((0, 0), (more, more)))
+        padding = (self._smooth_taps.shape[1] - exact.shape[1]) // 2
+        exact = np.pad(exact, ((0, 0), (padding, padding)))
         return _shortened(a * exact + (1.0 - a) * self._smooth_taps)
 
     def _ratio(self, exact_mm: list[Array], shares: tuple[float, float]) -> float:
-        """Return the mean against the shaper; infinite where any member is worse."""
+        """Return the mean error relative to the shaper; infinite if any member is worse."""
         a = np.array(shares)[:, None]
         ours = np.array(
             [
@@ -271,7 +270,7 @@ class _Trial:
 
 
 def _shortened(taps: Array) -> Array:
-    """Return the shortest of the lengths that loses nothing."""
+    """Return the taps at the shortest length that loses nothing."""
     for reach in _REACHES:
         more = taps.shape[1] // 2 - reach
         lost = np.delete(taps, np.s_[more : taps.shape[1] - more], axis=1)

@@ -1,4 +1,4 @@
-"""Planned motion in blocks, with the command that the Klipper extra computes from it."""
+"""Compute the command of the Klipper extra from planned motion, block by block."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 
 class LiveMotion:
-    """The stream of a file through a filter that looks ahead; rests are motion like any other.
+    """The motion of a file through a look-ahead filter, rests included.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Predict live printing (the extra inside Klipper), by itself or beside the compensated file."""
+"""Predict live printing (the extra inside Klipper), alone or beside the compensated file."""
 
 from __future__ import annotations
 
@@ -65,12 +65,12 @@ def simulate_live(
 
 
 def keep_file(source: Path, target: Path) -> None:
-    """Put a file as it is where a compensated one would be written.
+    """Copy a file unchanged to where a compensated one would be written.
 
     Raises
     ------
     GcodeError
-        The target is called as if it were a file of another kind.
+        The target's name is that of another kind of file.
     OSError
     """
     ends = source.suffix.lower(), target.suffix.lower()
@@ -84,14 +84,14 @@ def keep_file(source: Path, target: Path) -> None:
 
 @dataclass(frozen=True, slots=True)
 class LivePrediction:
-    """What stands of live printing in the report of a compensated file.
+    """What the report of a compensated file says about live printing.
 
     Attributes
     ----------
     way : PrintWay or None
         None: it cannot be printed live, and `refusal` says why.
     cpu_s : float
-        What the prediction took.
+        CPU time of the prediction.
     """
 
     way: PrintWay | None
@@ -115,7 +115,7 @@ def predict_live(
     cache_dir: Path | None = None,
     progress: ProgressCallback | None = None,
 ) -> LivePrediction:
-    """Predict, for a file that is being compensated, the print with live compensation instead.
+    """Predict how a file that is being compensated would print live instead.
 
     The figures are those of `simulate_live`.
 
@@ -156,7 +156,7 @@ def _way(
 
 
 def _before(progress: ProgressCallback | None) -> ProgressCallback | None:
-    """Return a callback for work before the job's own: it only shows that work goes on."""
+    """Return a callback for the time before the job, which only shows that work goes on."""
     if progress is None:
         return None
     tell = progress

@@ -1,4 +1,4 @@
-"""The motion along a file: measured, added up, and shown to the compensator."""
+"""Measure and sum the motion along a file, and show it to the compensator."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class MotionRecord:
     measurement : Measurement
     totals : Totals
     changing : (Compensator, Verifier), optional
-        They are told of all motion of the machine; None: the file is not changed.
+        They follow all motion of the machine; None: the file is not changed.
     """
 
     def __init__(
@@ -49,14 +49,14 @@ class MotionRecord:
     def begin(self, piece: Piece) -> None:
         """Let a piece begin where the machine stands."""
         if self._sum.jumped and self._changing is not None:
-            # Homed, say: the machine did not come here along the path.
+            # The machine did not get here along the path (homing, for example).
             self._changing[0].reset(self._asked(piece, piece.phases).start_mm[0, :2])
             self._sum.jumped = False
 
     def as_written(
         self, piece: Piece, paced: Piece, made: CompensatedPiece, executed: Phases
     ) -> MotionSamples:
-        """Planned and executed motion of a piece on one grid of real time."""
+        """Return planned and executed motion of a piece on one time grid."""
         asked = self._asked(paced, paced.phases)
         planned, position, row, extruding = as_executed(made, asked, executed)
         sliced = planned
@@ -66,7 +66,7 @@ class MotionRecord:
         return self._samples(piece, row, planned, position, extruding, sliced)
 
     def as_sliced(self, piece: Piece) -> MotionSamples:
-        """Motion of a piece as the firmware makes it of the sliced file."""
+        """Return the motion of a piece as the firmware executes the sliced file."""
         phases = piece.phases
         grid = (0.0, DT_S, max(round(phases.duration_s / DT_S), 1))
         path, row = sample_phases(self._asked(piece, phases), grid)
@@ -88,7 +88,7 @@ class MotionRecord:
             self.wait(part)
 
     def wait(self, dwell_s: float) -> None:
-        """Let the machine stand in the written file."""
+        """Count a standstill in the written file."""
         self._sum.time_s += dwell_s
         if dwell_s <= 0.0:
             return

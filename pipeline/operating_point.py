@@ -1,4 +1,4 @@
-"""The operating point along a file: the print's mass on its bed, and the height."""
+"""Track the operating point along a file: mass of the print on its bed, and height."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["Operation"]
 _ALL_KNOWN = 7
 _LONGEST_RETRACTION_MM = 20.0
 """Filament pulled back further has left the hotend: a change of filament or tool, after which the
-firmware may load on its own, so that the retraction is no longer counted against extrusion."""
+firmware may load by itself. Such a retraction is not offset against later extrusion."""
 
 
 class Operation:
@@ -30,8 +30,8 @@ class Operation:
     Attributes
     ----------
     printed_kg : float
-        Filament that lies on the bed. Feeding counts where X or Y moves, beyond what was pulled
-        back before; what runs out while the nozzle stands ends in a bin or is wiped off.
+        Filament on the bed. Feeding counts while X or Y moves, net of retraction; what is extruded
+        while the nozzle stands is purged or wiped off.
 
     Notes
     -----
@@ -52,9 +52,9 @@ class Operation:
         self._used: dict[str, tuple[float, float]] = {}
 
     def at(self, moves: Moves) -> OperatingPoint:
-        """Return where the machine is while these moves run, which come next.
+        """Return the operating point of the next moves.
 
-        The mass is that at half of their filament, the position where they first print.
+        The mass is that at half of their filament, the position that where they first print.
         """
         if not self._machine.schedules:
             return self._point
@@ -70,12 +70,12 @@ class Operation:
         return self._point
 
     def passed(self, moves: Moves) -> None:
-        """Count the filament of moves that are done."""
+        """Count the filament of completed moves."""
         laid_mm, self._furthest_mm = self._laid(moves)
         self.printed_kg += self._kg_per_mm * laid_mm
 
     def notes(self) -> list[str]:
-        """Return notes on the mass and height that the plants followed."""
+        """Return notes on the masses and heights that the plants followed."""
         notes = []
         for axis, schedule in self._machine.schedules.items():
             follows = []
@@ -95,7 +95,7 @@ class Operation:
         return notes
 
     def _laid(self, moves: Moves) -> tuple[float, float | None]:
-        """Filament that the moves lay down, and the extruder's furthest position after them."""
+        """Return the filament laid by the moves and the extruder's furthest position after them."""
         if self._kg_per_mm == 0.0 or len(moves) == 0:
             return 0.0, self._furthest_mm
         e_mm = moves.end_mm[:, 3]

@@ -1,4 +1,4 @@
-"""What the user chooses for one job."""
+"""The options of a compensation job."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _AS_SLICED = {
     "live": "prints the file as sliced",
     "none": "writes the file as sliced",
 }
-"""Methods that compensate no move in the file, and what they do instead."""
+"""Methods that do not compensate moves in the file, and what they do instead."""
 _METHOD = rf"^(advise|live|({'|'.join(_PLAIN)})(\+ripple)?)$"
 
 
@@ -106,7 +106,7 @@ class Options(BaseModel):
 
     @property
     def vibration(self) -> str:
-        """The method without what it does against ripple."""
+        """The method without `+ripple`."""
         return self.method.removesuffix("+ripple")
 
     @property
@@ -145,7 +145,7 @@ class Options(BaseModel):
 
     @model_serializer(mode="wrap")
     def _without_unused(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        # Digests of options are kept for long: what came later counts only where it is used.
+        # Stored digests must stay valid: newer options count only where they are used.
         values: dict[str, Any] = handler(self)
         for name, unused in _LATER.items():
             if values.get(name) == unused:
@@ -154,7 +154,7 @@ class Options(BaseModel):
 
 
 def unused(options: Options) -> list[str]:
-    """Return a sentence for the choices of a job that its method has no use for."""
+    """Return warnings about options that the method does not use."""
     method = options.method
     names = [] if options.vibration == "fbf" else ["basis", "robust", "along"]
     if method in _AS_SLICED:

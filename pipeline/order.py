@@ -1,4 +1,4 @@
-"""The options with which a file is compensated, and the pieces reverted after the last check."""
+"""The options of a compensation, and the pieces reverted after the last check."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ __all__ = ["Order"]
 
 _ALL = -1
 _MOST_REFUSED = 3
-"""Pieces that are reverted one by one after the last check; then all are."""
+"""Pieces reverted singly after the last check; then all are."""
 
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """What a file is compensated with.
+    """Options of a compensation, and pieces to leave as sliced.
 
     Attributes
     ----------
     refused : dict
-        Why pieces stay as sliced, by one of their lines (`_ALL`: every piece).
+        Reasons by a line of the piece (`_ALL`: every piece).
     """
 
     machine: Machine
@@ -35,7 +35,7 @@ class Order:
     refused: dict[int, str] = field(default_factory=dict)
 
     def reverting(self, error: LastCheckError, pieces: Sequence[tuple[int, int]]) -> Order:
-        """Return an order without the piece in which the last check found fault.
+        """Return an order that reverts the piece refused by the last check.
 
         Parameters
         ----------
@@ -45,7 +45,7 @@ class Order:
         Raises
         ------
         LastCheckError
-            When every piece was reverted already.
+            If every piece was already reverted.
         """
         piece = next((first for first, last in pieces if last >= error.stream_line), None)
         if piece is None or error.stream_line == 0 or _ALL in self.refused:
@@ -60,6 +60,6 @@ class Order:
         return replace(self, refused={**self.refused, piece: reason})
 
     def refusal(self, first: int, last: int) -> str | None:
-        """Return why a piece with these lines stays as sliced, if it does."""
+        """Return the reason why a piece with these lines stays as sliced; else None."""
         found = (reason for line, reason in self.refused.items() if first <= line <= last)
         return next(found, self.refused.get(_ALL))

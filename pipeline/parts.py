@@ -1,4 +1,4 @@
-"""A file as a sequence of parts: pieces that may be compensated, and verbatim parts."""
+"""Split a file into pieces that may be compensated, and verbatim parts."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["FileParts", "refuse_processed"]
 
 
 class FileParts:
-    """Read a file from where it is, block by block.
+    """Read a file block by block from its current position.
 
     Parameters
     ----------
@@ -27,7 +27,7 @@ class FileParts:
     reader : Interpreter
     splitter : Splitter
     clock : StageClock
-        Counts reading and planning.
+        Times reading and planning.
     """
 
     def __init__(
@@ -51,13 +51,13 @@ class FileParts:
 
 
 def refuse_processed(block: ProgramBlock, do: str = "compensate") -> None:
-    """Raise GcodeError for a block of a file that this program wrote, also without its comments.
+    """Raise GcodeError for a block written by this program, even if its comments were removed.
 
     Parameters
     ----------
     block : ProgramBlock
     do : str
-        What the user had better do with the original.
+        What the message tells the user to do with the original.
     """
     stamped = np.flatnonzero(block.events.kind == EventKind.STAMP)
     if len(stamped):
@@ -76,7 +76,7 @@ def refuse_processed(block: ProgramBlock, do: str = "compensate") -> None:
 
 
 def _line_at(block: ProgramBlock, place: int) -> int | None:
-    """Return the number of the line at a place of the block's text, counted from an event."""
+    """Return the line number at an offset of the block's text, counted from an event."""
     events, offset = block.events, block.text_offset
     before = int(np.searchsorted(events.byte_start, offset + place, side="right")) - 1
     if before < 0:

@@ -1,4 +1,4 @@
-"""Compensates a piece of a print: from its planned path to command, segments and timed moves."""
+"""Compensate a piece of a print: from its planned path to command, segments and timed moves."""
 
 from __future__ import annotations
 
@@ -50,9 +50,9 @@ _REST_TOLERANCE_S = 5e-3
 _ROUNDS = 2
 MIN_STEP_MM_S = 5.0
 _ACCEL_SHARES = (1.0, 0.8, 0.6, 0.5)
-"""Shares of the largest acceleration, tried in turn where a motor's speed steps by too much."""
+"""Shares of the largest acceleration, tried in turn where a motor's speed step is too large."""
 _SOFT_S = (2e-3, 4e-3, 8e-3)
-"""Half-width of the mean that rounds the path's corners, tried in turn where they are too sharp."""
+"""Half-widths of the moving mean that rounds corners, tried in turn where they are too sharp."""
 
 _FEED_REACH, _FEED_REACH_MM = 2.5, 0.5
 """Half-width of the smoothing of filament along the path: a multiple of the filament per mm of
@@ -60,7 +60,7 @@ path, and the most in mm."""
 _ROUNDED = 1.0 + 1e-9
 _EXTRUDING_EXCESS_MM = 20e-3
 _TRAVEL_EXCESS_MM = 200e-3
-"""How far the executed motion may be from the command beyond the tolerance, at worst."""
+"""Largest distance of the executed motion from the command beyond the tolerance."""
 
 
 class Unfit(ValueError):
@@ -68,7 +68,7 @@ class Unfit(ValueError):
 
 
 class _Sudden(Unfit):
-    """A motor's speed would step by too much, or the firmware cannot follow within its limits."""
+    """A motor's speed step is too large, or the firmware cannot follow within its limits."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +84,7 @@ class CompensatedPiece:
     segments : Segments
     encoded : Encoded
     step_mm, bend_mm : float
-        Longest step of the command in X Y, and largest second difference of either.
+        Longest step of the command in XY, and largest second difference of either axis.
     """
 
     timeline: Timeline
@@ -106,7 +106,7 @@ class PieceCompensator:
     shaper : BestShaper, optional
         The tuned frequencies, for `shaper:NAME` of the same type.
     caution : Caution, optional
-        How much of a shaper's smoothing `fbf` takes.
+        Mixture of `fbf` and a shaper.
     """
 
     def __init__(
@@ -127,7 +127,7 @@ class PieceCompensator:
         self._filter = _error_filter(machine)
         command = machine.command
         steps = [command.of(axis).speed_step_mm_s for axis in ("x", "y")]
-        # One limit serves both axes: one with a higher limit counts as if it moved less.
+        # One limit serves both axes: the motion of an axis with a higher limit is scaled down.
         self._of_a_step = np.array([*(command.speed_step_mm_s / step for step in steps), 1.0, 1.0])
         self._grid = OperatingGrid(machine, step=DESIGN_STEP, blend_step=BLEND_STEP)
         self._level: OperatingPoint | None = None
@@ -139,12 +139,12 @@ class PieceCompensator:
         ----------
         piece : Piece
         point : OperatingPoint
-            Where the machine is meanwhile; without schedules it does not matter.
+            Operating point; only matters with schedules.
 
         Raises
         ------
         Unfit
-            When no command within the machine's limits is found, or the firmware would refuse it.
+            If no command within the machine's limits is found, or the firmware would refuse it.
         """
         try:
             if self._machine.schedules:
@@ -154,7 +154,7 @@ class PieceCompensator:
             raise Unfit(str(error)) from error
 
     def _eased(self, piece: Piece) -> CompensatedPiece:
-        """Compensate, with less acceleration or rounder corners where the motors need it."""
+        """Compensate with less acceleration or rounder corners where the motors need it."""
         first: _Sudden | DesignError | None = None
         for share in _ACCEL_SHARES:
             if not self.compensator.ease(share):
@@ -165,7 +165,7 @@ class PieceCompensator:
             except _Sudden as error:
                 first = first or error
             except DesignError as error:
-                # With less it does not follow the path.
+                # With less acceleration it does not follow the path.
                 first = first or error
                 break
         self.compensator.ease(1.0)
@@ -187,13 +187,13 @@ class PieceCompensator:
             self._filter = _error_filter(machine_at(self._machine, nodes[len(nodes) // 2]))
 
     def _compensate(self, piece: Piece, soft_s: float = 0.0) -> CompensatedPiece:
-        """Compensate the path, or its mean over `soft_s` before and after."""
+        """Compensate the path, or its moving mean over `soft_s` on either side."""
         phases = intended(piece.phases, piece.moves.start_mm, piece.moves.end_mm, self._step_mm)
         groups = group_rows(phases)
         resting = np.array([group.rest for group in groups])
         rest_s = self.encoder.rest_durations(piece, groups)
         feeds = phases.direction[:, 3] > 0.0
-        # How long a rest takes depends a little on the speeds around it: repeat until it agrees.
+        # The duration of a rest depends slightly on the speeds around it: iterate until consistent.
         for _ in range(_ROUNDS):
             timeline = build_timeline(
                 phases,
@@ -218,7 +218,7 @@ class PieceCompensator:
             if change < _REST_TOLERANCE_S:
                 break
             rest_s = np.where(resting, encoded.rest_s, rest_s)
-        # Vertices are rounded, and moved on where they would coincide.
+        # Vertices are rounded to samples, and moved where they would coincide.
         at = np.rint(encoded.start_s / DT_S).astype(np.int64)
         row = timeline.row[np.minimum(at, len(timeline.row) - 1)]
         self._check_travel(encoded.position[:, :2].T / 1e6, row, piece)
@@ -232,10 +232,10 @@ class PieceCompensator:
     def _fit(
         self, piece: Piece, timeline: Timeline, command: NDArray[np.float64], bend_mm: float
     ) -> tuple[Segments, Encoded]:
-        """Segments and moves; finer where a motor's speed would step too far."""
+        """Return segments and moves, finer where a motor's speed step would be too large."""
         limit = self._machine.command.speed_step_mm_s
         tolerance = self._tolerance_mm
-        # No step of speed larger than what the command itself asks for within a sample.
+        # Speed steps are limited to the largest change of the command's speed within a sample.
         step_mm_s = max(bend_mm / timeline.dt_s, MIN_STEP_MM_S)
         for _ in range(3):
             segments = fit_segments(
@@ -261,17 +261,17 @@ class PieceCompensator:
         )
 
     def _keep_inside(self, segments: Segments) -> None:
-        """Bring vertices back that the fit's tolerance or the grid would put off the bed."""
+        """Clamp vertices that the fit's tolerance or the grid would put off the bed."""
         grid_mm = self.encoder.grid_mm
         for i, axis in enumerate(("x", "y")):
             travel = self._machine.travel[axis]  # type: ignore[index]
-            # The last lines of the grid on the bed, but for the rounding of decimals.
+            # Outermost grid lines on the bed, with a margin for rounding.
             low = np.ceil(travel.min_mm / grid_mm - 1e-6) * grid_mm
             high = np.floor(travel.max_mm / grid_mm + 1e-6) * grid_mm
             np.clip(segments.end_mm[i], low, high, out=segments.end_mm[i])
 
     def _speed_step(self, phases: Phases) -> float:
-        """Largest step of a motor's speed beyond what rounding to whole steps may bring."""
+        """Return the largest step of a motor's speed, less what rounding to steps may cause."""
         return speed_step(
             phases.accel_s,
             phases.cruise_s,
@@ -281,13 +281,13 @@ class PieceCompensator:
             phases.accel_mm_s2,
             phases.direction * self._of_a_step,
             max(self._step_mm[:2]),
-            # Ramps are parts of a step there, and no motor can tell.
+            # Ramps are shorter than a motor step there, so the motor does not notice them.
             max(self._step_mm) > 0.0,
             self._machine.kinematics == "corexy",
         )
 
     def _check_motors(self, command_mm: NDArray[np.float64]) -> None:
-        """Check that X and Y (2, n) together keep the limits of the motors of a CoreXY."""
+        """Check that X and Y (2, n) together keep the motor limits of a CoreXY."""
         motors = self._machine.command.motors
         if motors is None:
             return
@@ -307,7 +307,7 @@ class PieceCompensator:
     def _check_travel(
         self, place_mm: NDArray[np.float64], row: NDArray[np.int64], piece: Piece
     ) -> None:
-        """Check that places (2, n), each of a row of the piece's phases, lie within the travel."""
+        """Check that positions (2, n), each with its row in the phases, lie within the travel."""
         for i, axis in enumerate(("x", "y")):
             travel = self._machine.travel[axis]  # type: ignore[index]
             if travel.min_mm <= place_mm[i].min() and place_mm[i].max() <= travel.max_mm:
@@ -342,11 +342,11 @@ def _designed(
 
 
 def _mean(path_mm: NDArray[np.float64], reach: int) -> NDArray[np.float64]:
-    """Mean over `reach` samples before and after each, shape (2, n); it stood and will stand."""
+    """Return the moving mean over `reach` samples on either side, shape (2, n), ends held."""
     if reach == 0:
         return path_mm
     padded = np.pad(path_mm, ((0, 0), (reach + 1, reach)), mode="edge")
-    # From the start: sums of large numbers would lose digits.
+    # Relative to the start: sums of large numbers would lose digits.
     total = np.cumsum(padded - path_mm[:, :1], axis=1)
     width = 2 * reach + 1
     return np.asarray(path_mm[:, :1] + (total[:, width:] - total[:, :-width]) / width)
@@ -359,8 +359,8 @@ def _error_filter(machine: Machine) -> ErrorFilter:
 def _retract_along(command: NDArray[np.float64], timeline: Timeline, phases: Phases) -> None:
     """Spread the filament that wipes pull back evenly over the command's path, in place.
 
-    Klipper limits such moves by E per mm of X Y. The command stands where the plan creeps and the
-    other way round; filament at the plan's times would then need impossible accelerations.
+    Klipper limits such moves by E per mm of XY. The command may stand where the plan creeps, and
+    vice versa: filament at the plan's times would need impossible accelerations.
     """
     wipes = phases.moves_xy & (phases.direction[:, 3] < 0.0)
     if not np.any(wipes):
@@ -368,7 +368,7 @@ def _retract_along(command: NDArray[np.float64], timeline: Timeline, phases: Pha
     inside = wipes[timeline.row] & timeline.moving
     last = command.shape[1] - 1
     for first, end in runs(inside):
-        # From the plan's own ends: the samples around a wipe may lie in a retraction at rest.
+        # Use the plan's ends: samples around a wipe may lie in a retraction at rest.
         row, stop = timeline.row[first], timeline.row[end - 1] + 1
         begins = phases.start_mm[row, 3]
         ends = phases.start_mm[stop, 3] if stop < len(phases) else command[3, last]
@@ -381,10 +381,10 @@ def _retract_along(command: NDArray[np.float64], timeline: Timeline, phases: Pha
 
 
 def _feed_evenly(command: NDArray[np.float64], extruding: NDArray[np.bool_]) -> None:
-    """Smooth the filament over the command's way wherever it prints without a break, in place.
+    """Smooth the filament along the command's path within each printed run, in place.
 
-    The command has other speeds in a corner than the plan has, the filament has the plan's: per mm
-    of way it comes in steps there, which firmwares brake for, the more the thicker the line.
+    In corners the command's speed differs from the plan's, which the filament follows: the filament
+    per mm of path is uneven there, and firmwares brake for it, more so on thick lines.
     """
     for first, end in runs(extruding):
         span = slice(max(first - 1, 0), end)
@@ -392,7 +392,7 @@ def _feed_evenly(command: NDArray[np.float64], extruding: NDArray[np.bool_]) -> 
         way_mm = np.append(0.0, np.cumsum(np.hypot(*np.diff(command[:2, span]))))
         if way_mm[-1] <= 0.0:
             continue
-        # Up to the ends of the run the mean is over less, so that all of it stays between them.
+        # The mean narrows towards the ends of the run, so that the total is unchanged.
         reach_mm = min(_FEED_REACH * fed_mm[-1] / way_mm[-1], _FEED_REACH_MM)
         reach = np.minimum(np.minimum(way_mm, way_mm[-1] - way_mm), reach_mm)
         area = np.append(0.0, np.cumsum(0.5 * (fed_mm[1:] + fed_mm[:-1]) * np.diff(way_mm)))
@@ -403,10 +403,10 @@ def _feed_evenly(command: NDArray[np.float64], extruding: NDArray[np.bool_]) -> 
 
 
 def follow_tolerance_mm(firmware: FirmwareAdapter, tolerance_um: float) -> float:
-    """Return how far executed motion may be from its command, but for some exceptions.
+    """Return how far executed motion may normally be from its command.
 
-    Where vertices lie on steps, and when steps come, are off by up to a step each. What is shorter
-    than the shortest move goes another way, there and back.
+    Rounding of vertices to steps, and the timing of steps, each add up to one step. Moves below the
+    shortest one are merged, which adds up to its length there and back.
     """
     coarse_mm = max(2.0 * np.hypot(*firmware.step_mm[:2]), 2.0 * firmware.shortest_move_mm)
     return 1e-3 * tolerance_um + float(coarse_mm)
@@ -415,15 +415,15 @@ def follow_tolerance_mm(firmware: FirmwareAdapter, tolerance_um: float) -> float
 def strayed(
     gap_mm: NDArray[np.float64], extruding: NDArray[np.bool_], tolerance_mm: float
 ) -> str | None:
-    """Return in words how far motion is from its command if that is too far.
+    """Return a message if motion is too far from its command; else None.
 
     Parameters
     ----------
     gap_mm : ndarray, shape (n,)
-        As `deviation` gives it.
+        From `deviation`.
     extruding : ndarray of bool, shape (n,)
     tolerance_mm : float
-        As `follow_tolerance_mm` gives it.
+        From `follow_tolerance_mm`.
     """
     worst = float(np.max(gap_mm, initial=0.0))
     if worst <= tolerance_mm + _EXTRUDING_EXCESS_MM:
@@ -438,9 +438,9 @@ def strayed(
 
 
 def deviation(piece: CompensatedPiece, executed: Phases) -> NDArray[np.float64]:
-    """Distance in X Y of the executed motion from the command, at the command's samples.
+    """Return the XY distance of the executed motion from the command at the command's samples.
 
-    A stretch counts from its own start: rests may take a little longer or shorter than planned.
+    Each stretch is timed from its own start: rests may be slightly longer or shorter than planned.
     """
     timeline, encoded = piece.timeline, piece.encoded
     first = np.round(timeline.start_s / timeline.dt_s - 0.5).astype(np.int64)
@@ -453,7 +453,7 @@ def deviation(piece: CompensatedPiece, executed: Phases) -> NDArray[np.float64]:
         timeline.dt_s,
         first,
         encoded.group_start_s - timeline.start_s - origin_s,
-        # In a rest, time waits where the stretch after it begins.
+        # During a rest, time stops at the beginning of the next stretch.
         np.append(encoded.group_start_s[1:], np.inf) - origin_s,
     )
 
@@ -461,20 +461,20 @@ def deviation(piece: CompensatedPiece, executed: Phases) -> NDArray[np.float64]:
 def as_executed(
     piece: CompensatedPiece, phases: Phases, executed: Phases
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64], NDArray[np.bool_]]:
-    """Planned and executed motion of a piece on one grid of real time.
+    """Return planned and executed motion of a piece on one time grid.
 
     Parameters
     ----------
     piece : CompensatedPiece
     phases : Phases
-        What the file asks for (`gcode.firmware.planning.intended`).
+        The intended motion (`gcode.firmware.planning.intended`).
     executed : Phases
 
     Returns
     -------
     planned_mm, executed_mm : ndarray, shapes (3, n) and (2, n)
     row : ndarray of int64, shape (n,)
-        Row of the piece's `phases`.
+        Row in the piece's `phases`.
     extruding : ndarray of bool, shape (n,)
     """
     dt_s = piece.timeline.dt_s

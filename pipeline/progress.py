@@ -1,4 +1,4 @@
-"""Progress of a job, and how it is cancelled."""
+"""Progress reports of a job, and its cancellation."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ __all__ = ["Cancelled", "Progress", "ProgressCallback", "ProgressReports", "prog
 
 
 _SURE = 0.02
-"""Share after which the time still needed can be told."""
+"""Share after which the remaining time can be estimated."""
 
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """Where a job is.
+    """Progress of a job.
 
     Attributes
     ----------
     stage : str
-        What is being done, for a person: `compensating`, `measuring`, ...
+        Current stage as shown to users: `compensating`, `measuring`, ...
     fraction : float
-        Done so far, 0 to 1.
+        Share done so far, 0 to 1.
     print_seconds : float
         Seconds of printing handled so far.
     elapsed_s : float
         Wall time since the job began.
     eta_s : float or None
-        Wall time still needed; None while it is unknown.
+        Estimated remaining wall time; None while unknown.
     """
 
     stage: str
@@ -43,11 +43,11 @@ class Cancelled(Exception):
 
 
 ProgressCallback = Callable[[Progress], None]
-"""Called now and then; may raise `Cancelled`."""
+"""Called from time to time; may raise `Cancelled`."""
 
 
 class ProgressReports:
-    """Tells where a job is, and how long it may still take.
+    """Reports the progress of a job, and estimates its remaining time.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ class ProgressReports:
         self._began = time.monotonic()
 
     def say(self, stage: str, fraction: float, print_s: float = 0.0) -> None:
-        """Tell the stage, the share of all that is done, and the seconds of printing handled."""
+        """Report the stage, the overall share done, and the seconds of printing handled."""
         if self._callback is None:
             return
         elapsed_s = time.monotonic() - self._began
@@ -72,7 +72,7 @@ def progress_to(
 ) -> Callable[[float], None]:
     """Return a callback for a stage before or after the work that `fraction` counts.
 
-    What it is given, the share of the stage itself, only shows that work goes on.
+    Its argument, the share of the stage itself, is ignored: it only shows that work goes on.
     """
     began = time.monotonic()
 

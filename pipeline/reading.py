@@ -1,4 +1,4 @@
-"""Opens a job's file in the dialect of the machine's firmware, or in a requested one."""
+"""Choose the dialect in which a job's file is read, and warn if it looks like another."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ __all__ = ["dialect_for", "doubts", "passed_over"]
 _SHOWN = 5
 _END_BYTES = 1 << 18
 _OFFSHOOTS = ("prusa", "bambu")
-"""Dialects of Marlin that a Marlin machine may be told to read by."""
+"""Dialects that may be requested for a Marlin machine."""
 _EXPECTED = ("klipper", "marlin")
 
 
 def dialect_for(machine: Machine, name: DialectName | None = None) -> Dialect:
-    """Return how a file for a machine is read.
+    """Return the dialect in which a file for a machine is read.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ def dialect_for(machine: Machine, name: DialectName | None = None) -> Dialect:
     Raises
     ------
     ModelError
-        The firmware reads every file its own way, and that is not this one.
+        The firmware does not read this dialect.
     """
     firmware = machine.firmware
     if isinstance(firmware, Marlin) and name in _OFFSHOOTS:
@@ -53,18 +53,18 @@ def dialect_for(machine: Machine, name: DialectName | None = None) -> Dialect:
 
 
 def doubts(file: BinaryIO, machine: Machine, name: DialectName | None = None) -> list[str]:
-    """Return a warning if a file looks like one for another firmware than it is read by.
+    """Return a warning if a file looks as if it were made for another firmware.
 
     Parameters
     ----------
     file : binary file
-        Its text; the place in it is kept.
+        Its text; the position is preserved.
     name : str, optional
-        A dialect that was asked for: whoever asks has no doubts.
+        A requested dialect: then there are no warnings.
 
     Notes
     -----
-    Klipper reads Marlin's flavour: what it does not know there it passes over, as slicers expect.
+    Klipper reads Marlin's flavour: it skips commands that it does not know, as slicers expect.
     """
     if name is not None:
         return []
@@ -88,7 +88,7 @@ def doubts(file: BinaryIO, machine: Machine, name: DialectName | None = None) ->
 
 
 def passed_over(reader: Interpreter) -> list[str]:
-    """Return, in a few lines, what the firmware skips and what is unknown."""
+    """Return a few warnings about commands that the firmware skips or that are unknown."""
     found = reader.warnings
     more = [f"... and {len(found) - _SHOWN} more lines like these"] if len(found) > _SHOWN else []
     return [*found[:_SHOWN], *more]

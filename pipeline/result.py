@@ -1,4 +1,4 @@
-"""The result of a job, in figures measured on the written file."""
+"""The result of a job: figures measured on the written file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Selects the sections worth compensating: where errors are visible, and the motion before them."""
+"""Select the sections worth compensating: visible ones, and the motion before them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _WALLS = frozenset({Feature.OUTER_WALL, Feature.OVERHANG_WALL, Feature.THIN_WALL
 _VISIBLE = _WALLS | {Feature.TOP_SURFACE, Feature.SKIN, Feature.IRONING, Feature.BOTTOM_SURFACE}
 _CHOSEN = {"visible": _VISIBLE, "walls": _WALLS}
 _TOLERANCES_UM = (8.0, 16.0)
-"""Tried in turn where a file is too large; beyond them other limits place the vertices."""
+"""Tried in turn where a file is too large; larger ones save nothing, as other limits act."""
 _WORTH_S = 0.5
 """Shorter stretches are not worth the lines that end a stream and begin the next one."""
 
@@ -33,8 +33,8 @@ class TooLarge(Exception):
 def smaller(options: Options) -> Options | None:
     """Return options that write a smaller file, or None where there are none.
 
-    What costs least goes first (docs/benchmarks.md, "Compensated where it shows"): what nobody
-    sees, then exactness, then surfaces.
+    What costs least is given up first (docs/benchmarks.md, "Compensated where it shows"): hidden
+    features, then accuracy, then surfaces.
     """
     if options.where == "all":
         return options.model_copy(update={"where": "visible"})
@@ -47,9 +47,9 @@ def smaller(options: Options) -> Options | None:
 class Selection:
     """Leave sections with invisible features as sliced.
 
-    A section (`gcode.dividing`) is compensated as a whole if it prints any feature that counts, or
-    one that the slicer does not name. Travel right before such a section is compensated with it:
-    its vibration would last into the wall.
+    A section (`gcode.dividing`) is compensated as a whole if it prints any selected feature, or one
+    that the slicer does not name. Travel right before it is compensated too, as its vibration
+    would last into the wall.
 
     Parameters
     ----------
@@ -63,17 +63,17 @@ class Selection:
         self._machine = machine
         self._features = _CHOSEN.get(where)
         self._counts: dict[int, bool] = {-1: True}
-        """Whether a feature counts, by its number."""
+        """Whether a feature is selected, by its number."""
 
     def divide(
         self, item: Piece | VerbatimPart, names: Sequence[str]
     ) -> Iterator[Piece | VerbatimPart | LeftOut]:
-        """Cut a piece into what is compensated and what is left out; the rest passes through.
+        """Split a piece into compensated and left-out sections; other items pass through.
 
         Parameters
         ----------
         names : sequence of str
-            The slicer's names behind the numbers of features.
+            The slicer's names, indexed by feature number.
         """
         if self._features is None or not isinstance(item, Piece):
             yield item
@@ -81,7 +81,7 @@ class Selection:
             yield from divided(item, self._wanted(item, names), self._machine)
 
     def rms_um(self, features: Sequence[GroupFigures]) -> dict[str, float]:
-        """Return the contour error of what is compensated, root mean square, by channel."""
+        """Return the rms contour error of what is compensated, by channel."""
         ours = [one for one in features if self._named(one.name)]
         total_s = sum(one.seconds for one in ours)
         names = ours[0].contour_rms_um if ours else ()

@@ -1,7 +1,7 @@
-"""Applies the firmware's own input shaper, as it changes along a file, to planned motion.
+"""Apply the firmware's own input shaper, as it changes along a file, to planned motion.
 
-Every step of the path is spread over time by the pulses that are in force when it is made. A file
-can only change them where the machine rests, so this is what the firmware does, and nothing jumps.
+Every increment of the path is spread over time by the pulses in force at that moment. A file can
+change them only where the machine rests, so this is what the firmware does, without jumps.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ __all__ = ["ShapedMotion", "shaped"]
 Array = NDArray[np.float64]
 
 _REACH_S = 0.2
-"""How much later or earlier than planned a shaper may move: 3hump_ei at 10 Hz."""
+"""Largest delay or advance of a shaper: 3hump_ei at 10 Hz."""
 
 
 class ShapedMotion:
     """Motion that arrives in blocks, with the firmware's command for it.
 
-    Shapers are centred, as Klipper's are: a constant delay is no error of the path.
+    Shapers are centred, like Klipper's: a constant delay is not a path error.
 
     Parameters
     ----------
@@ -63,13 +63,13 @@ class ShapedMotion:
     def _begin(self) -> None:
         self._last: Array | None = None
         self._early = self._reach
-        """Samples before the first one, still to be dropped."""
+        """Number of samples before the first one still to be dropped."""
         self._pending = np.zeros((2, 2 * self._reach))
         self._offset = np.zeros(2)
         self._away: deque[Array] = deque()
 
     def _spread(self, path: Array, shaping: Shaping) -> None:
-        """Add the difference between shaped and unshaped steps of a path."""
+        """Add the difference between shaped and unshaped increments of a path."""
         last = path[:, :1] if self._last is None else self._last[:, None]
         steps = np.diff(np.concatenate([last, path], axis=1))
         self._last = path[:, -1].copy()
@@ -113,7 +113,7 @@ def shaped(path_mm: Array, shaping: Shaping, dt_s: float) -> Array:
 
 
 def _late(shaper: AxisShaper, dt_s: float, reach: int) -> list[tuple[float, int, float]]:
-    """Pulses as weight, whole samples of delay and the part of a sample beyond."""
+    """Return pulses as weight, whole samples of delay and fractional sample."""
     weights, delays = shaper.pulses()
     late = np.clip((delays - float(weights @ delays)) / dt_s, -reach, reach - 2)
     return [

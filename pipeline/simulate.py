@@ -1,4 +1,4 @@
-"""Simulates the motion of a file without changing it: to a table of samples, or to a report."""
+"""Simulate the motion of a file without changing it, as a table of samples or as a report."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ _COLUMNS = ("t", "x", "y", "z", "e")
 
 @dataclass(frozen=True, slots=True)
 class PlannedTime:
-    """How long a file takes: as planned, and as its slicer says (None: it does not).
+    """Print time of a file: as planned, and as its slicer states (None: it does not).
 
-    `warnings` say what the firmware passes over, or what of the file raises doubts.
+    `warnings` name commands that the firmware skips, and doubts about the file.
     """
 
     time_s: float
@@ -60,12 +60,12 @@ def plan_file(
     dialect: DialectName | None = None,
     progress: ProgressCallback | None = None,
 ) -> PlannedTime:
-    """Write the motion that the firmware makes of a file as a table of samples.
+    """Write the motion of a file, as the firmware executes it, as a table of samples.
 
     Parameters
     ----------
     source : Path
-        Any print file of any kind, also one that was compensated.
+        A print file of any kind, also a compensated one.
     target_npz : Path
         Arrays ``t`` [s, 0 at the first move], ``x y z`` [mm, machine axes] and ``e`` [mm, the
         firmware's cumulative extruder position], written whole or not at all.
@@ -75,7 +75,7 @@ def plan_file(
     plate : int, optional
         Which plate of a 3MF package with several.
     dialect : str, optional
-        How the file is read; None: as the machine's firmware reads it.
+        Dialect of the file; None: that of the machine's firmware.
     progress : callable, optional
 
     Returns
@@ -125,7 +125,7 @@ def simulate_motion(
     trace: Callable[[Trace], None] | None = None,
     live: LiveFilter | None = None,
 ) -> Result:
-    """Predict the vibration of a file that was opened; parameters as `simulate_file` has them.
+    """Predict the vibration of an opened file; other parameters are those of `simulate_file`.
 
     With `live` the motion is also what the extra of Klipper makes of it.
     """
@@ -177,7 +177,7 @@ def simulate_motion(
 
 @dataclass(slots=True)
 class _Seen:
-    """What is added up while motion is measured."""
+    """Sums over the measured motion."""
 
     extruding_s: float = 0.0
     peak_velocity_mm_s: float = 0.0
@@ -196,7 +196,7 @@ def measured(
     operation: Operation,
     clock: StageClock,
 ) -> _Seen:
-    """Measure a whole motion as the firmware's shaper, or the filter in Klipper, passes it on."""
+    """Measure a motion after the firmware's shaper, or after the filter in Klipper."""
     seen = _Seen()
 
     def add(ready: Iterator[tuple[MotionSamples, OperatingPoint]]) -> None:

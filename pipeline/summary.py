@@ -1,4 +1,4 @@
-"""Summarises a job: its figures, and the warnings that belong to them."""
+"""Summarise a job: its figures, warnings and notes."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ from stillpath.version import __version__
 __all__ = ["SHAPER_IS_BETTER", "Summary"]
 
 SHAPER_IS_BETTER = "The firmware's own shaper would serve this file better"
-"""How the warning begins."""
+"""Beginning of the warning."""
 
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """What a job knows at its end.
+    """What a job knows when it ends.
 
     Attributes
     ----------
     writer : StreamWriter or None
         None: the file stays as it is, and is only measured.
     choice : Choice or None
-        The mixture chosen for the machine's set; None: none was.
+        The mixture chosen for the machine's set, if any.
     budget : (SpeedBudget, BudgetMeasurement) or None
     """
 
@@ -87,7 +87,7 @@ class Summary:
         )
 
     def _channels(self) -> list[Channel]:
-        """Return the figures of the whole print, with what counts where a part is compensated."""
+        """Return the figures of the print and, if only a part is compensated, of that part."""
         after = "as written" if self.writer is None else "compensated"
         channels = self.measurement.channels(after)
         if self.options.where != "all":
@@ -106,7 +106,7 @@ class Summary:
         if typed is not None:
             yield typed
         elif self.writer is not None:
-            # First, as it says that the file had better not be printed.
+            # First, because it advises against printing the file.
             yield from self._outdone({c.name: c.judged_rms_um for c in channels})
         yield from self.totals.warnings
         yield from passed_over(self.reader)

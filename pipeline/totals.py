@@ -1,4 +1,4 @@
-"""Running totals of one file, and the warnings that follow from them."""
+"""Running totals of a file, and the warnings that follow from them."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from stillpath.pipeline.result import PutBack
 __all__ = ["NOT_COMPENSATED", "Totals"]
 
 NOT_COMPENSATED = "of the extruding time is not compensated"
-"""How the warning begins, after the share."""
+"""Beginning of the warning, after the share."""
 
 _WARN_SHARE = 0.2
 """Share of the extruding time above which the report warns that it is not compensated."""
 
 
 class Totals:
-    """What adds up along a file."""
+    """Sums along a file."""
 
     def __init__(self) -> None:
         self.moves = self.pieces = self.segments = self.written = 0
@@ -38,7 +38,7 @@ class Totals:
         self.jumped = True
 
     def add_piece(self, made: CompensatedPiece, executed: Phases, gap: np.ndarray) -> None:
-        """Add a piece as it was written, and how far its motion is from its command."""
+        """Add a piece as written, and the distance of its motion from its command."""
         timeline, segments = made.timeline, made.segments
         seconds = executed.duration_s + float(timeline.start_s[0])
         self.time_s += seconds
@@ -74,12 +74,12 @@ class Totals:
             self.passed_line = self.passed_line or int(verbatim.moves.line[first])
 
     def figures(self, *, compensates: bool) -> dict[str, Any]:
-        """Return the fields of `Result` that are sums, or follow from them.
+        """Return the fields of `Result` that are sums or follow from sums.
 
         Parameters
         ----------
         compensates : bool
-            Else the file is only measured, and nothing of it is left alone.
+            Otherwise the file is only measured, and nothing counts as left alone.
         """
         rate = self.segments / self.compensated_s if self.compensated_s else 0.0
         return {
@@ -88,7 +88,7 @@ class Totals:
             "written_bytes": self.written,
             "segments": self.segments,
             "segments_per_s": rate,
-            # Counted by the second, and a piece may be shorter.
+            # The peak is counted over whole seconds, but a piece may be shorter.
             "peak_segments_per_s": max(self.peak_rate, rate),
             "peak_velocity_mm_s": self.peak_velocity,
             "peak_accel_mm_s2": self.peak_accel,
@@ -118,7 +118,7 @@ class Totals:
 
     @property
     def left_alone_s(self) -> float:
-        """Time of the motion whose lines were never to be changed."""
+        """Time of the motion whose lines were not to be changed."""
         return max(self.passed_motion_s - sum(piece.seconds for piece in self.put_back), 0.0)
 
     @property
@@ -127,7 +127,7 @@ class Totals:
         return max(self.passed_s - self.put_back_s, 0.0)
 
     def left_out(self, where: str) -> Iterator[str]:
-        """Yield warnings about what was left as sliced by the options of the job."""
+        """Yield warnings about what the options of the job left as sliced."""
         if where != "all":
             yield (
                 f"where={where}: {self.left_out_s:.0f} s of motion are left as sliced, "

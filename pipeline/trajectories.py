@@ -1,6 +1,6 @@
-"""Motion of the nozzle sample by sample: commanded and simulated, as a table.
+"""Write the commanded and simulated motion of the nozzle as a table of samples.
 
-The pipeline runs again on the sliced file, up to the end of what is asked for.
+The pipeline is run again on the sliced file, up to the end of the requested window.
 """
 
 from __future__ import annotations
@@ -46,21 +46,21 @@ def write_trajectories(
     source : Path
         The sliced file.
     target : Path
-        Written whole or not at all. Columns: ``t_s``; ``x_mm y_mm z_mm``, the motion that the
+        Written atomically. Columns: ``t_s``; ``x_mm y_mm z_mm``, the motion that the
         firmware makes of the sliced file; ``after_x_mm after_y_mm``, that of the written file;
         ``before_sim_x_mm``, ..., the nozzle according to the machine's model;
         ``before_contour_um``, ``after_contour_um``, its distance to the planned path; ``line`` and
         ``layer`` of the sliced file (-1: before the first layer); ``extruding``, 0 or 1.
     options : Options
-        Those of the job. Of an advised file the motion is that of the written one, and so are its
-        lines; no column is called ``before``.
+        Options of the job. For an advised file, motion and lines are those of the written file, and
+        there are no ``before`` columns.
     format : {"csv", "npz"}
         Text (some 110 bytes a row, lengths to 0.1 um), or NumPy arrays.
     window_s : (start, stop)
-        Of the time axis of reports: the written file's, stands beyond 2 s left out. A stop of None
-        is the end.
+        On the time axis of reports: that of the written file, with standstills cut to 2 s. A stop
+        of None is the end.
     cache_dir, progress
-        As `compensate_file` has them.
+        As in `compensate_file`.
 
     Returns
     -------
@@ -70,7 +70,7 @@ def write_trajectories(
     Raises
     ------
     GcodeError
-        Nothing lies in the window; or as `compensate_file` has it, with its other errors.
+        Nothing lies in the window; otherwise as `compensate_file`, as are other errors.
     """
     start_s, stop_s = window_s
     _check_window(start_s, stop_s)
@@ -107,7 +107,7 @@ def _run(
     cache_dir: Path | None,
     progress: ProgressCallback | None,
 ) -> None:
-    """Compensate a file again; motion of an advised one comes from what was written."""
+    """Compensate a file again; the motion of an advised file is read from the written one."""
     options = options.model_copy(update={"compare_live": False})
     how: dict[str, Any] = {"cache_dir": cache_dir, "progress": progress, "trace": window.add}
     if options.method == "advise":
@@ -118,7 +118,7 @@ def _run(
 
 
 class _Window:
-    """Write what lies between two times; `end_s` is how far the motion went."""
+    """Writes the samples between two times; `end_s` is the end of the motion so far."""
 
     def __init__(
         self, table: Table, names: tuple[str, ...], start_s: float, stop_s: float | None
@@ -131,7 +131,7 @@ class _Window:
 
     def add(self, trace: Trace) -> None:
         count = len(trace.line)
-        if trace.first == 0:  # or once more from the beginning, with a section reverted
+        if trace.first == 0:  # also when restarted with a piece reverted
             self._table.clear()
             self.rows = 0
         first = max(self._first - trace.first, 0)
@@ -164,7 +164,7 @@ class _Window:
 
 
 class _Passed(Exception):
-    """All that was requested is written."""
+    """The requested window is complete."""
 
 
 @contextlib.contextmanager

@@ -1,4 +1,4 @@
-"""Verbatim parts: lines that are not changed, and their moves as the firmware plans them."""
+"""Plan the moves of verbatim parts, whose lines are not changed."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ def plan_verbatim(verbatim: VerbatimPart, machine: Machine) -> Iterator[Phases |
     Yields
     ------
     Phases
-        Motion from rest to rest, from time 0 on; `move_index` counts within the verbatim part.
+        Motion from rest to rest, starting at time 0; `move_index` counts within the part.
     float
-        Seconds of standing.
+        A standstill [s].
     None
         The position becomes unknown here.
     """
@@ -49,10 +49,10 @@ def plan_verbatim(verbatim: VerbatimPart, machine: Machine) -> Iterator[Phases |
 
 
 def takes_s(part: Phases | float | None) -> float:
-    """Return how long a part of a verbatim part takes."""
+    """Return the duration of a part of a verbatim part."""
     return part.duration_s if isinstance(part, Phases) else part or 0.0
 
 
 def switching_s(parts: Iterable[VerbatimPart | ProgramBlock]) -> float:
-    """Return how long the machine stands still because its shaper is switched."""
+    """Return how long the machine stands still for switching its shaper."""
     return sum(float(np.sum(p.events.dwell_s[p.events.kind == EventKind.SHAPER])) for p in parts)

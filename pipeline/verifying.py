@@ -1,4 +1,4 @@
-"""Accepts or rejects a compensated piece: executed as commanded, and no worse than as sliced."""
+"""Check that a compensated piece is executed as commanded, and no worse than as sliced."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ from stillpath.simulation.scheduled import MachineStream
 __all__ = ["NEGLIGIBLE_UM", "Verifier"]
 
 NEGLIGIBLE_UM = 1.0
-"""Contour error that nobody sees: below it, which of two is smaller does not matter."""
+"""Invisible contour error: below it, which of two is smaller does not matter."""
 
 _TIME_EXCESS_S = 20e-3
 _END_MM = np.array([1e-6, 1e-6, 1e-6, 1e-4])
-"""How far a piece may end from where the original does, x y z e, beyond a step of the motors."""
+"""Largest distance between the ends of a piece and its original, x y z e, beyond a motor step."""
 _STRIDE = 6
 _PAST = 2000
-"""Samples of motion before a piece, whose vibration may last into it."""
+"""Samples of motion kept from before a piece, as vibration may last into it."""
 _CLEARLY = 1.1
 
 
 class Verifier:
-    """Judge compensated pieces by their read-back motion.
+    """Checks compensated pieces by their read-back motion.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ class Verifier:
         self._machine = machine
         self._step_mm = np.array(firmware.step_mm)
         self._tolerance_mm = follow_tolerance_mm(firmware, tolerance_um)
-        # What is too short for a move of its own is executed by the next one.
+        # Motion too short for a move of its own is executed with the next one.
         self._waits_mm = firmware.shortest_move_mm
         self._end_mm = self._step_mm + _END_MM
         if self._waits_mm > 0.0:
@@ -64,10 +64,10 @@ class Verifier:
         Parameters
         ----------
         piece : Piece
-            As it came.
+            The piece as sliced.
         made : CompensatedPiece
         gap_mm : ndarray
-            Distance from the command, as `pipeline.piece_compensator.deviation` gives it.
+            Distance from the command (`pipeline.piece_compensator.deviation`).
         executed : Phases
 
         Raises
@@ -84,7 +84,7 @@ class Verifier:
         tolerance_mm = self._end_mm
         last_mm = made.command_mm[:2, round(timeline.start_s[-1] / timeline.dt_s) :]
         if np.max(np.ptp(last_mm, axis=1)) < self._waits_mm:
-            # All of the last stretch may wait.
+            # The whole last stretch may still be pending.
             late_s = max(late_s, min(late_s + lasts_s, 0.0))
             tolerance_mm = np.maximum(tolerance_mm, [self._waits_mm, self._waits_mm, 0.0, 0.0])
         if abs(late_s) > _TIME_EXCESS_S:
@@ -94,9 +94,9 @@ class Verifier:
             raise Unfit(f"read back, the piece ends at {end.round(6)}, not at {wanted.round(6)}")
 
     def passed(self, command_mm: NDArray[np.float64] | None) -> None:
-        """Take note of motion, shape (2, n): the machine vibrates on when a piece begins.
+        """Record motion, shape (2, n), whose vibration may last into the next piece.
 
-        None: the position is lost, and the machine stands still when motion goes on.
+        None: the position is lost, and the machine stands still when motion resumes.
         """
         if command_mm is None:
             self._past_mm = self._past_mm[:, :0]
@@ -111,14 +111,14 @@ class Verifier:
         Parameters
         ----------
         motion : MotionSamples
-            Without `sliced_mm`, where the firmware rounds to no steps, nothing is done.
+            Without `sliced_mm` (the firmware does not round to steps) nothing is done.
         point : OperatingPoint
-            Where the machine is.
+            Operating point.
 
         Raises
         ------
         Unfit
-            When the sliced lines would print better.
+            If the sliced lines would print better.
         """
         if motion.sliced_mm is None:
             return
@@ -126,12 +126,12 @@ class Verifier:
         meter = MotionMeter(DT_S, stride=_STRIDE, channels=len(commands))
         past = self._past_mm
         path_mm = np.hstack([past, motion.path_mm])
-        answers = [
+        responses = [
             MachineStream(self._machine, DT_S, point).push(np.hstack([past, command]), path_mm)
             for command in commands
         ]
         extruding = np.append(np.zeros(past.shape[1], np.bool_), motion.extruding)
-        meter.push(path_mm, np.stack(answers), extruding)
+        meter.push(path_mm, np.stack(responses), extruding)
         meter.flush()
         sliced_um, ours_um = (1e3 * tally.rms for tally in meter.contour_extruding)
         if ours_um > max(_CLEARLY * sliced_um, NEGLIGIBLE_UM):

@@ -1,4 +1,4 @@
-"""Two ways to print a file compensated: as it is written, or live inside Klipper."""
+"""Describe the two ways to print compensated: from the written file, or live in Klipper."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def file_way(result: Result) -> PrintWay:
     Parameters
     ----------
     result : Result
-        Of a file that was compensated.
+        Result of a compensated file.
     """
     channel = next(channel for channel in result.channels if channel.name == "after")
     return PrintWay(
@@ -43,11 +43,11 @@ def live_way(channel: Channel, time_s: float, size: int) -> PrintWay:
     Parameters
     ----------
     channel : Channel
-        What was predicted for it.
+        Predicted figures.
     time_s : float
-        How long the file takes as sliced.
+        Print time as sliced.
     size : int
-        Of the file as sliced, in bytes.
+        Size of the sliced file [bytes].
     """
     return PrintWay(
         name="live",
@@ -70,10 +70,10 @@ def live_way(channel: Channel, time_s: float, size: int) -> PrintWay:
 
 
 def _figures(channel: Channel) -> dict[str, float | tuple[float, float] | None]:
-    """Return the figures of a channel; of all motion where nothing is extruded."""
+    """Return the figures of a channel: while extruding, or of all motion if nothing is."""
     extrudes = channel.extruding.contour_max_um > 0.0
     errors = channel.extruding if extrudes else channel.all_motion
-    # Where a part is compensated, the range is that part's.
+    # If only a part is compensated, the range is of that part.
     whole = extrudes and channel.selected_rms_um is None
     return {
         "contour_rms_um": errors.contour_rms_um,

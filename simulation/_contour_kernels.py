@@ -1,4 +1,4 @@
-"""Loops of the error measures; `simulation.measures` gives them names and checks."""
+"""Kernels of the error measures, wrapped and checked by `simulation.measures`."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 BOX = 16
 """Segments of the path that share a box."""
 _STRAIGHT_MM = 1e-11
-"""A vertex so near to the line on which a run has come goes straight on: rounding is less."""
+"""A vertex this close to the line of a run continues it; rounding is smaller."""
 
 
 @kernel(allocates=False)
@@ -32,7 +32,7 @@ def path_tables(
 ) -> None:
     """Prepare the polyline `path`, shape (2, n), for many distances.
 
-    Segments that go straight on make one run, whose distance from a point is that of a segment.
+    Collinear segments form one run, which is treated as a single segment.
 
     Parameters
     ----------
@@ -90,16 +90,16 @@ def contour_distances(
     window: int,
     out: Array,
 ) -> int:
-    """Distance of points to the stretch of the path that is near them in time.
+    """Compute the distances of points to the part of the path that is near them in time.
 
     Point i belongs to the vertex `centres[i]` of the path; its distance is taken to the segments
-    between the vertices up to `window` before and after. A guess, the lag of the point before, is
-    nearly always on the right run; boxes of segments that are all further away are passed over.
+    between the vertices up to `window` before and after. The lag of the previous point is nearly
+    always a good first guess; boxes whose segments are all further away are skipped.
 
     Returns
     -------
     int
-        Straight lines looked at.
+        Number of straight lines examined.
     """
     n = path.shape[1]
     looked = 0
@@ -151,7 +151,7 @@ def contour_errors(
     window: int,
     out: Array,
 ) -> int:
-    """`path_tables`, and `contour_distances` of the points (channels, 2, m) of all channels."""
+    """Run `path_tables`, then `contour_distances` for points (channels, 2, m) of all channels."""
     path_tables(path, first, last, boxes)
     looked = 0
     for c in range(len(points)):
@@ -195,23 +195,23 @@ def motion_sums(
     rest: Array,
     sums: Array,
 ) -> None:
-    """Add up the distances of points to the path's point of the same instant.
+    """Sum the distances of points to the path's point at the same instant.
 
     Parameters
     ----------
     x, y : ndarray, shape (n,)
-        The path; rows, as part of an array's columns would have to be copied.
+        The path as separate rows, since a slice of columns would have to be copied.
     points : ndarray, shape (channels, 2, n)
     still_mm : float
-        Steps of an axis up to this are no motion.
+        Changes of an axis up to this do not count as motion.
     shortest, window : int
-        A rest counts once `shortest` samples stood still after a motion, with its first `window`.
+        The first `window` samples of a rest count if it has at least `shortest`.
     rest : ndarray, shape (6,)
-        Carried on: last x, y of the path, still samples (-1 before the first motion), samples of
-        the rest that wait, samples that count, rests that count.
+        Updated in place: last x, y of the path, still samples (-1 before the first motion), pending
+        samples of the rest, samples that count, rests that count.
     sums : ndarray, shape (channels, 8)
-        Carried on, squares: sum and maximum of all, of extruding, of the rest that waits, and of
-        rests that count.
+        Updated in place; sum and maximum of squares: of all, of extruding, of the pending rest, and
+        of rests that count.
     """
     n = len(x)
     if n > 0 and math.isnan(rest[0]):
@@ -221,7 +221,7 @@ def motion_sums(
         next_k = k
         while next_k < n and _moved(x, y, next_k, rest, still_mm):
             next_k += 1
-        # Where the path moves on, samples have no part in rests.
+        # While the path moves, samples do not belong to rests.
         last = next_k - 1 if shortest > 0 else k
         if k < last:
             _add_squares(x[k:last], y[k:last], points[:, :, k:last], extruding[k:last], sums)
@@ -251,7 +251,7 @@ def _add_squares(
             ex, ey = points[c, 0, k] - x[k], points[c, 1, k] - y[k]
             squared = ex * ex + ey * ey
             total += squared
-            # Comparisons, as nothing then waits for the largest of the samples before.
+            # A comparison, which does not depend on the maximum of the samples before.
             if squared > most:
                 most = squared
             if extruding[k]:

@@ -1,6 +1,6 @@
-"""Closed loops sample by sample: with an add-on controller, several rates, noise and limits.
+"""Simulate closed loops with an add-on controller, several rates, noise and limits.
 
-A loop and its add-on are one block diagram (`models.diagrams`); here it gets signals from outside.
+A loop and its add-on form one block diagram (`models.diagrams`), driven by external signals.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Imperfections:
-    """What a real loop adds to the linear one.
+    """Nonlinearities and noise of a real loop.
 
     Attributes
     ----------
@@ -42,7 +42,7 @@ class Imperfections:
 
 
 class ClosedLoop:
-    """A loop with an add-on, fed block after block.
+    """A loop with an add-on, simulated block by block.
 
     Parameters
     ----------

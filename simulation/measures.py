@@ -1,8 +1,8 @@
-"""Errors of an executed motion against the planned one, summed block by block.
+"""Measure errors of an executed motion against the planned one, block by block.
 
 Contour error: distance from the point y(t) to the planned path within +-80 ms of t. Tracking
-error: distance to the planned point of the same instant. Residual vibration: what still moves
-in the first 0.1 s after the plan came to rest.
+error: distance to the planned point of the same instant. Residual vibration: deviation in the
+first 0.1 s after the plan came to rest.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ Ints = NDArray[np.int32]
 Mask = NDArray[np.bool_]
 
 WINDOW_S = 0.08
-"""How far from its sample, in time, the nearest point of the path is looked for."""
+"""Time before and after a sample in which the nearest point of the path is searched."""
 _RESIDUAL_S = 0.1
 _SHORTEST_REST_S = 0.02
 _STILL_MM = 1e-9
@@ -54,7 +54,7 @@ class Tally:
 
     @property
     def rms(self) -> float:
-        """Root mean square; 0 of nothing."""
+        """Root mean square; 0 without values."""
         return float(np.sqrt(self.square_sum / self.count)) if self.count else 0.0
 
     def add(self, values: Array, use: Mask | None = None) -> None:
@@ -109,7 +109,7 @@ class GroupTally:
         before = max(self.lowest - low, 0)
         after = max(high - (self.lowest + len(self.count) - 1), 0)
         if before or after:
-            # Room for as many again: layers come one by one.
+            # Grow by doubling: layers arrive one by one.
             after = max(after, len(self.count)) if after else 0
             self.lowest -= before
             self.count = np.pad(self.count, (before, after))
@@ -142,14 +142,14 @@ class ContourErrors:
 
 
 class ContourMeter:
-    """Contour errors of motions beside one path that arrive in blocks.
+    """Contour errors of motions along one path that arrive in blocks.
 
     Parameters
     ----------
     dt_s : float
         Sampling time.
     window_s : float
-        The path counts this long before and after a point's instant; less at start and end.
+        Time before and after a point in which the path counts; less at start and end.
     stride : int
         Samples 0, stride, 2 stride, ... are measured; the path keeps all samples.
     channels : int
@@ -158,7 +158,7 @@ class ContourMeter:
     Attributes
     ----------
     evaluations : int
-        Distances from points to straight lines worked out so far.
+        Number of point-to-line distances computed so far.
     """
 
     def __init__(
@@ -267,7 +267,7 @@ class ChosenMeter:
 
 
 class MotionMeter:
-    """All measures of motions beside one path, with when something is extruded.
+    """All measures of motions along one path, overall and while extruding.
 
     Parameters
     ----------

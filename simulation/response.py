@@ -1,4 +1,4 @@
-"""Linear response of a machine's axes to a command, block by block."""
+"""Simulate the linear response of a machine's axes to a command, block by block."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 
 _BLOCK, _LEAST_BLOCKS = 16, 4
-"""Samples of a block, and how many blocks are worth the products."""
+"""Samples of a block, and the least number of blocks that justifies matrix products."""
 
 
 @dataclass(slots=True)
@@ -45,11 +45,10 @@ class _Axis:
 
 
 class _Blocks:
-    """The response of modes to many samples, a block of them at a time.
+    """The response of modes to many samples, computed in blocks.
 
-    A block's positions are linear in its commands and in the states at its start, and so are the
-    states after it: what is left of the recurrence goes from block to block, and the rest are
-    products of matrices.
+    A block's positions and final states are linear in its commands and initial states: the
+    recurrence only runs from block to block, and the rest are matrix products.
     """
 
     def __init__(self, modes: Array, d: float) -> None:
@@ -69,7 +68,7 @@ class _Blocks:
         self._step = np.stack([step.real, step.imag], axis=1)
 
     def push(self, u: Array, origin: float, state: Array, y: Array) -> int:
-        """Fill `y` for whole blocks and carry `state` on; return how many samples that are."""
+        """Fill `y` for whole blocks and update `state`; return the number of samples."""
         blocks = len(u) // _BLOCK
         if blocks < _LEAST_BLOCKS:
             return 0
@@ -110,7 +109,7 @@ class PlantStream:
         self._origin = None
 
     def push(self, u_mm: Array, out: Array | None = None) -> Array:
-        """Return the positions that answer the command block `u_mm`, shape (axes, n).
+        """Return the response to the command block `u_mm`, shape (axes, n).
 
         They are written to `out`, if that is given.
         """
@@ -121,7 +120,7 @@ class PlantStream:
         if u.shape[1] == 0:
             return y
         if self._origin is None:
-            # Counting from the start keeps digits: the response of a shift is that shift.
+            # Relative to the start for precision: the response to an offset is that offset.
             self._origin = u[:, 0].copy()
         for axis, origin, row_u, row_y in zip(self._axes, self._origin, u, y, strict=True):
             axis.push(np.ascontiguousarray(row_u), float(origin), row_y)

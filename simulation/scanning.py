@@ -21,7 +21,7 @@ class TrackErrors:
     rms, largest : ndarray
         Of the distance to where the beam should be at that time.
     across : ndarray
-        rms of its part across the track: where the line lies, whenever it is drawn.
+        rms of its component across the track, independent of timing.
     total_rms, total_largest, total_across : float
         Over all samples of all tracks.
     """

@@ -1,4 +1,4 @@
-"""Designs and judges an add-on controller, and simulates the machine with and without it."""
+"""Design and check an add-on controller, and simulate the machine with and without it."""
 
 from __future__ import annotations
 
@@ -45,17 +45,17 @@ __all__ = ["Designed", "design_controller", "fitting_methods", "loop_figures"]
 Array = NDArray[np.float64]
 
 _LARGEST_WORK = 1.2e9
-"""Cube of the states times plants: some ten seconds of eigenvalues."""
+"""Limit on states cubed times plants: about ten seconds of eigenvalues."""
 _OTHER_STATES = 60
 _SMALLEST = 1e-6
 _BINS = 240
 _LOWEST_SHARE = 1 / 2000
-"""Of the sampling rate: where the curves begin."""
+"""Lowest frequency of the curves, relative to the sampling rate."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Designed:
-    """A controller with the figures about it."""
+    """A controller and its figures."""
 
     controller: Controller
     report: ControllerReport
@@ -67,7 +67,7 @@ def design_controller(spec: LoopSpec, options: ControllerOptions) -> Designed:
     Raises
     ------
     DesignError
-        If the method does not fit the machine, takes too long to judge, or is refused
+        If the method does not fit the machine, takes too long to check, or is refused
         (`compensation.feedback.controller.Refusal`).
     ModelError
         If the machine, or another that the options name, is not valid.
@@ -110,7 +110,7 @@ def design_controller(spec: LoopSpec, options: ControllerOptions) -> Designed:
 def fitting_methods(spec: LoopSpec) -> tuple[str, ...]:
     """Return the methods that can be designed for a machine, with settings that suit it.
 
-    Those with a plant inverse are tried, because the plant's zeros decide.
+    Methods with a plant inverse are tried, because that depends on the plant's zeros.
     """
     loops = spec.loops()
     rate = 1.0 / loops[0].dt_s
@@ -242,7 +242,7 @@ def _check_fit(spec: LoopSpec, nominal: Loop, method: str) -> None:
 
 
 def _check_size(spec: LoopSpec, loops: tuple[Loop, ...], options: ControllerOptions) -> None:
-    """Refuse what would take minutes to judge before anything is computed."""
+    """Refuse, before computing anything, designs that would take minutes to check."""
     states = _OTHER_STATES
     if isinstance(options, WideOptions):
         states += round(1.0 / (loops[0].dt_s * options.fundamental_hz))
@@ -288,7 +288,7 @@ def _curves(controller: Controller, nominal: Loop, options: ControllerOptions) -
 
 
 def _kept(f_hz: Array, curves: list[Array]) -> NDArray[np.int64]:
-    """Return where to look at curves so that none loses an extreme on a logarithmic axis."""
+    """Return samples of curves for a logarithmic axis that keep all extremes."""
     where = np.log(f_hz / f_hz[0]) / np.log(f_hz[-1] / f_hz[0])
     starts = np.unique(np.searchsorted(where, np.arange(_BINS) / _BINS))
     kept = [0, len(f_hz) - 1]
@@ -302,7 +302,7 @@ def _kept(f_hz: Array, curves: list[Array]) -> NDArray[np.int64]:
 def _document(
     controller: Controller, spec: LoopSpec, nominal: Loop, options: ControllerOptions
 ) -> dict[str, object]:
-    """Return what is loaded, with all that it was made of."""
+    """Return the document to load, including the inputs of the design."""
     return controller.to_dict() | {
         "stillpath_version": __version__,
         "every": round(nominal.dt_s / controller.dt_s),

@@ -1,4 +1,4 @@
-"""Loads a controller from the JSON of `stillpath controller --json`, as a real controller would."""
+"""Load a controller from the JSON of `stillpath controller --json`, as a real controller would."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ class LoadedController:
     spec : LoopSpec
         The machine it was designed for.
     options : ControllerOptions
-        What it was designed with.
+        Options of the design.
     blocks : tuple of Block
     every : int
-        Ticks of the blocks per sample of the machine's loop.
+        Block samples per sample of the machine's loop.
     settling : int
         Samples of the loop in which the slowest transient decays to 1e-3.
     """

@@ -1,4 +1,4 @@
-"""Turns a designed controller into controller.html, controller.json and controller.h."""
+"""Write a designed controller as controller.html, controller.json and controller.h."""
 
 from __future__ import annotations
 
@@ -74,13 +74,13 @@ def short(value: float) -> str:
 
 
 def decibels(value: float, digits: int = 2) -> str:
-    """Return dB with a proper minus, and none before zero."""
+    """Return dB with a typographic minus, and none before zero."""
     text = f"{value:.{digits}f}"
     return text.lstrip("-") if float(text) == 0 else text.replace("-", "−")
 
 
 def _setting(value: object) -> str:
-    """Return a setting, or a list of them, without the digits of rounding."""
+    """Return a setting, or a list of them, without rounding residues."""
     if isinstance(value, float):
         return f"{value:.7g}"
     return ", ".join(map(_setting, value)) if isinstance(value, list | tuple) else str(value)
@@ -181,5 +181,5 @@ def _over_time(title: str, unit: str, lines: Sequence[Line]) -> Chart:
 
 
 def _db(value: float) -> float:
-    """Return dB, cut off where a curve would only make the others flat."""
+    """Return dB, cut off below so that other curves are not flattened."""
     return min(max(20 * math.log10(value), _LOWEST_DB), _HIGHEST_DB)

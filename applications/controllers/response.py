@@ -57,13 +57,13 @@ Array = NDArray[np.float64]
 
 _LEAST_SAMPLES, _MOST_SAMPLES = 2000, 200_000
 _MOST_TICKS = 3e7
-"""Of all plants together: some ten seconds."""
+"""Limit for all plants together: about ten seconds."""
 _POINTS = 400
 _PERIODS_SHOWN = 12
 _PART_SAMPLES = 3000
 _SLOWEST_HZ = 1e-3
 _LATEST_S = 60.0
-"""Of the beginning of a disturbance's last part."""
+"""Latest beginning of a disturbance's last part."""
 _HEARD_S = 1e-3
 _HARMONICS = 5
 _SEED = 0
@@ -72,7 +72,7 @@ _LARGEST_SIZE = 1e9
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trace:
-    """Output without and with an add-on that changed on the way."""
+    """Output without and with an add-on that was retuned during the run."""
 
     d: Array
     after: Array
@@ -81,8 +81,8 @@ class Trace:
 def disturbance_of(options: ControllerOptions, loop: Loop) -> tuple[Disturbance, str]:
     """Return the disturbance of the time response, and where it enters.
 
-    What is not asked for is what the method is made for: its tones, five harmonics of its
-    fundamental, or a slow load that changes sign.
+    By default it is what the method is made for: its tones, five harmonics of its fundamental, or a
+    slow load that changes sign.
     """
     made: Disturbance
     if isinstance(options, WideOptions | QuasiOptions | MultirateOptions):
@@ -131,7 +131,7 @@ def adapted(
     Raises
     ------
     DesignError
-        If it works on no tone at the end, or that controller is refused.
+        If it rejects no tone at the end, or that controller is refused.
     """
     _check(disturbance)
     nominal = loops[0]
@@ -177,7 +177,7 @@ def time_figures(
     ModelError
         If a frequency of the disturbance is not below half the sampling rate.
     DesignError
-        If the time asked for has too many samples.
+        If the requested time has too many samples.
     """
     nominal = loops[0]
     every = round(nominal.dt_s / controller.dt_s)
@@ -277,7 +277,7 @@ def _jumping(tones: int, dt_s: float) -> Switched:
 
 
 def _spoken(disturbance: Disturbance, dt_s: float) -> int:
-    """Return samples until the last of switched tones has had its time."""
+    """Return the samples needed until the last of switched tones has settled."""
     last = disturbance.start_s[-1] if isinstance(disturbance, Switched) else 0.0
     return round(last / dt_s) + 2 * _PART_SAMPLES
 

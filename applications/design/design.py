@@ -1,8 +1,8 @@
-"""Computes the design report for one axis of a machine, from the plant to the cost of model errors.
+"""Compute the design report for one axis of a machine, from the plant to the cost of model errors.
 
-The command lives on increments (docs/method.md), so the metrics and the ladder are those of the
-plant with two integrators in front, lifted over the preview window. Sources: dissertation of K. S.
-Ramani (paper 003), equation numbers beside each figure.
+The command is designed in increments (docs/method.md), so the metrics and the ladder are those of
+the plant with two integrators in front, lifted over the preview window. Sources: dissertation of K.
+S. Ramani (paper 003), equation numbers beside each figure.
 """
 
 from __future__ import annotations
@@ -57,13 +57,13 @@ Array = NDArray[np.float64]
 
 AXES = ("x", "y")
 ERRORS_PERCENT = tuple(range(-20, 21, 2))
-"""Errors of frequency at which every command is tried."""
+"""Frequency errors at which every command is evaluated."""
 _FREQUENCIES_HZ = tuple(np.geomspace(5.0, 200.0, 160).round(3).tolist())
 
 
 @dataclass(frozen=True, slots=True)
 class DesignSettings:
-    """What `compensation.fbf.PreviewFbf` is given.
+    """Settings of `compensation.fbf.PreviewFbf`.
 
     `robust` may also be ``auto``: the mode that jobs take by default, before a shaper's smoothing
     comes in. `dt_s` is the sampling time; `window_s` the preview window, of which `update_s` is
@@ -95,20 +95,20 @@ def design_report(
     machine : Machine
     axis : {"x", "y"}
     errors_percent : sequence of float
-        Errors of this axis' frequencies at which every command is tried.
+        Frequency errors of this axis at which every command is evaluated.
     shapers : sequence of str
         Firmware shapers to compare with.
     motion : (path, extruding), optional
         Shapes (2, n) in mm and (n,); default: the reference motion, some 25 s.
     tuned : mapping, optional
-        Shapers tuned before on this machine and motion
+        Shapers already tuned on this machine and motion
         (`pipeline.measuring.reference_shaper.tune_each`).
 
     Raises
     ------
     DesignError
-        For an unknown axis, basis or robust mode. A design that is refused is a finding, not an
-        error: the report says which and why.
+        For an unknown axis, basis or robust mode. A refused design is a result, not an error: the
+        report says which and why.
     """
     made = _designed(machine, axis, settings)
     trial = Trial(machine, axis, settings.dt_s, motion, errors_percent)
@@ -141,18 +141,18 @@ def design_report(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Designed:
-    """The designs of an axis, before they are tried.
+    """The designs of an axis, before they are evaluated.
 
     Attributes
     ----------
     row : int
-        Of the axis.
+        Row of the axis.
     by_mode : dict of str to PreviewFbf
         For every robust mode that can be designed.
     missing : list of str
         Why the others cannot.
     robust, mode : str
-        That is asked for, and that is designed: without a set all are one.
+        Requested mode, and designed mode: without a set all modes are equal.
     """
 
     plants: PlantSet
@@ -189,22 +189,22 @@ def _designed(machine: Machine, axis: str, settings: DesignSettings) -> _Designe
     _check_names(axis, settings)
     dt_s, row = settings.dt_s, AXES.index(axis)
     spec = machine.axes["x" if axis == "x" else "y"]
-    # What designs see: no command leads for a delay of slow motion (`PreviewFbf`).
+    # As in `PreviewFbf`, designs ignore delays of slow motion.
     plants = plant_set(spec.without_delay(), dt_s)
     by_mode, missing = _designers(machine, settings)
     robust = _robust_mode(machine, settings, by_mode)
-    # Without a set all robust modes are one.
+    # Without a set all robust modes are equal.
     mode = robust if robust in by_mode or len(plants.members) > 1 else "off"
     if mode in by_mode:
         lifted = by_mode[mode].lifted[row]
     else:
         window, update = (round(s / dt_s) for s in (settings.window_s, settings.update_s))
-        # Refused as a whole: its figures say why.
+        # Refused entirely: the figures say why.
         members, weights = plants.members, plants.weights
         if mode == "off":
             members, weights = (plants.nominal,), np.ones(1)
         lifted = lifted_window(members, weights, window, update)
-    # What the product refuses as a whole, no rung of it can be used for.
+    # If the compensator is refused entirely, none of its rungs can be used.
     whole = next((text for text in missing if text.startswith(f"fbf {mode}: ")), None)
     most = functions_within(spec.band_hz, dt_s)
     ladder = _ladder(plants, lifted, settings.basis, dt_s, whole, most)
@@ -224,7 +224,7 @@ def _check_names(axis: str, settings: DesignSettings) -> None:
 def _designers(
     machine: Machine, settings: DesignSettings
 ) -> tuple[dict[str, PreviewFbf], list[str]]:
-    """Return the compensators of all robust modes that differ, and why others are missing."""
+    """Return the compensators of all distinct robust modes, and why others are missing."""
     sets = any(len(axis.weighted_members()) > 1 for axis in machine.axes.values())
     made, missing = {}, []
     for mode in ROBUST if sets else ROBUST[:1]:
@@ -246,11 +246,11 @@ def _designers(
 def _robust_mode(
     machine: Machine, settings: DesignSettings, designers: Mapping[str, PreviewFbf]
 ) -> str:
-    """Return the mode that is asked for; of ``auto``, the one that jobs take."""
+    """Return the requested mode; for ``auto``, the one that jobs use."""
     if settings.robust != "auto":
         return settings.robust
     mode = design_mode(machine)
-    # As jobs do: where a set refuses itself, the plants in the middle are designed for.
+    # As in jobs: if the set is refused, design for the nominal plants.
     return mode if mode in designers else "off"
 
 
@@ -319,7 +319,7 @@ def _modes(plant: DiscretePlant) -> tuple[ModeFigures, ...]:
 def _singular_values(
     members: Sequence[DiscretePlant], weights: Array, window: int
 ) -> LiftedFigures:
-    """Return the singular values of the stack of sqrt(l_j) G_j: the plant's own if there is one."""
+    """Return the singular values of the stack of sqrt(l_j) G_j; for one plant, its own."""
     markov = np.array([p.impulse_response(window) for p in members])
     roots = np.sqrt(weights)
     position, increments = (
@@ -394,7 +394,7 @@ def _ladder(
     every = None
     if len(plants.members) > 1:
         every = _increments(plants.members, plants.weights, window)
-    # The very designs that the product uses.
+    # The same designs as in jobs.
     weights = tuple(lifted.weights.tolist())
     table = designs(lifted.plants, weights, window, lifted.update, basis, most)
     rungs = range(len(table.ladder))

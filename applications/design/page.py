@@ -1,7 +1,7 @@
-"""Turns a `DesignReport` into design.html and design.json.
+"""Write a `DesignReport` as design.html and design.json.
 
-The page is static: drawn here, without script, and with a content security policy that names the
-hash of its style and forbids all else.
+The page is static, without scripts, and has a content security policy that allows only its own
+style by hash.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ def render_design(report: DesignReport) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _Figure:
-    """A small chart with its caption, and what its lines are called in the table."""
+    """A small chart with its caption, and the names of its lines in the table."""
 
     title: str
     note: str
@@ -169,7 +169,7 @@ def _figure(
     *lines: Line,
     log: bool = True,
 ) -> _Figure:
-    """Return a figure over the number of functions n, the one that is taken marked."""
+    """Return a figure over the number of functions n, with the chosen one marked."""
 
     def tick(n: float) -> str:
         return f"{n:g}\n{n / (2 * report.window_s):.0f} Hz" if n else "0"
@@ -189,7 +189,7 @@ def _figure(
 
 
 def _plant_figures(report: DesignReport, figure: Callable[..., _Figure]) -> list[_Figure]:
-    """Return what the plant asks of any command: singular values and effort."""
+    """Return the plant's demands on any command: singular values and effort."""
     lifted, metrics = report.lifted, report.metrics
     counts = range(1, lifted.samples + 1)
     alone = report.robust == "off" or len(report.plant.members) < 2
@@ -224,7 +224,7 @@ def _plant_figures(report: DesignReport, figure: Callable[..., _Figure]) -> list
 
 
 def _error_figures(report: DesignReport, figure: Callable[..., _Figure]) -> list[_Figure]:
-    """Return the expected error, and of a set how sure each function is."""
+    """Return the expected error and, for a set, the robustness of each function."""
     metrics = report.metrics
     counts = range(1, report.lifted.samples + 1)
     lines = [Line(counts, metrics.error, "plain main", "Jₑ")]

@@ -33,7 +33,7 @@ _NO_RESTS = np.zeros((0, 2), np.int64)
 
 
 class Trial:
-    """One motion on one machine, one of whose axes may be another than it was designed for.
+    """One motion on a machine, one of whose axes may differ from the design.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ class Trial:
         mode : str
             Its setting of `robust`.
         rungs : sequence of str
-            What each step of the ladder is called.
+            Name of each step of the ladder.
 
         Raises
         ------

@@ -18,7 +18,7 @@ __all__ = ["Summary", "modes_text", "zero_text"]
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """A reading of a report."""
+    """Key figures derived from a report."""
 
     report: DesignReport
 
@@ -29,7 +29,7 @@ class Summary:
 
     @property
     def own(self) -> Curve | None:
-        """The command of the design that was asked for; None if it was refused."""
+        """The command of the requested design; None if it was refused."""
         wanted = f"fbf-{self.report.robust}"
         compensated = [c for c in self.report.robustness.curves if c.name.startswith("fbf-")]
         if len(self.report.plant.members) < 2 and wanted not in {c.name for c in compensated}:
@@ -38,7 +38,7 @@ class Summary:
 
     @property
     def rung(self) -> RungFigures | None:
-        """The step of the ladder that the reference motion takes."""
+        """The step of the ladder used for the reference motion."""
         return None if self.report.chosen is None else self.report.ladder[self.report.chosen]
 
     @property
@@ -53,7 +53,7 @@ class Summary:
 
     @property
     def reaches(self) -> list[float]:
-        """Half and all of the errors of frequency, in percent."""
+        """Half and all of the range of frequency errors, in percent."""
         largest = max(map(abs, self.report.robustness.errors_percent), default=0.0)
         return [largest / 2, largest] if largest else []
 

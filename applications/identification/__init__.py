@@ -1,1 +1,1 @@
-"""From measurement files to a machine of the store, with a page that shows how well it fits."""
+"""Identify machines from measurement files, with a page that shows the quality of the fit."""

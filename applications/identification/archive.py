@@ -1,4 +1,4 @@
-"""Keeps the figures of identifications by the content of the machine that they led to."""
+"""Store identification reports by the digest of the resulting machine."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ _REVISION = re.compile(r"[0-9a-f]{12}")
 
 
 class Archive:
-    """Reports by the `Machine.revision` that they led to.
+    """Identification reports by the resulting `Machine.revision`.
 
     Parameters
     ----------
     place : Path or Documents
-        Where they lie; a folder is made when the first report is kept.
+        Storage of the reports; a folder is made for the first report.
     """
 
     def __init__(self, place: Path | Documents) -> None:
@@ -33,7 +33,7 @@ class Archive:
         self._documents.replace(_file(report.machine_revision), report.model_dump_json())
 
     def find(self, revision: str) -> IdentificationReport | None:
-        """Return the report that led to a machine's content, None if there is none.
+        """Return the report of a machine's content, None if there is none.
 
         Raises
         ------

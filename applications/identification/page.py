@@ -1,4 +1,4 @@
-"""Turns an `IdentificationReport` into identification.html and identification.json."""
+"""Write an `IdentificationReport` as identification.html and identification.json."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def _magnitude(axis: AxisFigures) -> Figure:
         note += " Grey: members of the set."
     last = axis.model.f_hz[-1]
     marks = [Mark(m.f_hz, f"{m.f_hz:.1f} Hz") for m in _apart(axis.modes) if m.f_hz <= last]
-    # The measured ones on top: a good model would hide them.
+    # Measured curves on top, as a good model would hide them.
     return _figure("Magnitude", note, "|G|", [*members, model, *measured], True, marks)
 
 
@@ -157,7 +157,7 @@ def _style(number: int) -> str:
 
 
 def _apart(modes: Sequence[MeasuredMode]) -> list[MeasuredMode]:
-    """Leave out modes whose names would be written over each other on a phone, and fillers."""
+    """Leave out modes whose labels would overlap on a phone, and spurious modes."""
     out: list[MeasuredMode] = []
     for mode in sorted(modes, key=lambda m: m.zeta):
         if mode.zeta < 0.4 and all(abs(mode.f_hz - other.f_hz) > 25.0 for other in out):
@@ -187,7 +187,7 @@ def interval_text(value: float, deviation: float | None, digits: int) -> str:
 
 
 def change_text(mode: MeasuredMode, before: Sequence[MeasuredMode]) -> str:
-    """Tell which mode of the former model this one was."""
+    """Return a text about the corresponding mode of the former model."""
     near = min(before, key=lambda other: abs(other.f_hz - mode.f_hz))
     change = mode.f_hz / near.f_hz - 1
     return f"{near.f_hz:.1f} Hz ({100 * change:+.1f} %)" if abs(change) < _SAME_MODE else "new"

@@ -62,7 +62,7 @@ def identification_report(
     found : mapping
         Axis to what was identified.
     settings : ReadSettings
-        Those that the measurements were read with.
+        Settings with which the measurements were read.
     sources : sequence of SourceFile
     """
     return IdentificationReport(
@@ -133,7 +133,7 @@ def _curve(plant: PlantSpec, f: Array) -> ModelCurve:
 def _response(measured: FrequencyResponse, fit: Fit) -> ResponseFigures:
     step = -(-len(measured.f_hz) // _MOST_POINTS)
     f = measured.f_hz[::step]
-    # The delay of the recording is a nuisance of each run; the fit knows that of the mean.
+    # The recording's delay differs between runs; the fit has that of the mean.
     h = measured.response[::step] / (fit.gain * np.exp(-2j * np.pi * f * fit.delay_s))
     coherence = measured.coherence[::step]
     known = ~(coherence < _COHERENT)

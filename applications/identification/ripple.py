@@ -20,14 +20,14 @@ _FORM = "NAME:PITCH, NAME:PITCH:1,2,3 or either with @output appended"
 
 @dataclass(frozen=True, slots=True)
 class LearntRipple:
-    """A machine with ripple, and what it was learnt from."""
+    """A machine with ripple, and the sources of the learning."""
 
     machine: Machine
     sources: tuple[SourceFile, ...]
     summary: str
 
     def named(self, name: str | None, title: str | None) -> Machine:
-        """Return the machine under a name and title of its own, where they are given."""
+        """Return the machine, with another name and title if given."""
         machine = self.machine
         if name is not None and name != machine.name:
             title = title or f"{machine.title}, ripple learnt"

@@ -1,4 +1,4 @@
-"""From files to a machine with new plants; nothing is stored here."""
+"""Identify a machine with new plants from files; nothing is stored here."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class InputFile:
     name : str
         Without folder; tells axis and date.
     condition : Condition
-        What was different when it was measured.
+        Conditions of the measurement.
     """
 
     name: str
@@ -89,7 +89,7 @@ def identify_files(
     ----------
     files : sequence of InputFile
     base : Machine
-        Everything else comes from it.
+        Source of everything that was not measured.
     settings : ReadSettings, optional
     name, title : str, optional
         Of the machine, if it is a new one.
@@ -128,7 +128,7 @@ def _read_input(argument: str) -> InputFile:
 
 
 def _with_what_is_known(base: Machine, axis: Axis, found: AxisIdentification) -> AxisIdentification:
-    """Keep the moving mass that was known before, where no weight was put on the bed now."""
+    """Keep a known moving mass if no weight was put on the bed this time."""
     before, now = base.schedules.get(axis), found.schedule
     mass, grid = (now.mass, now.grid) if now else (None, None)
     notes, warnings = list(found.notes), list(found.warnings)
@@ -142,7 +142,7 @@ def _with_what_is_known(base: Machine, axis: Axis, found: AxisIdentification) ->
         else:
             notes.append(f"{known} stay: no weight was put on the bed")
     if grid is None and before is not None and before.grid is not None:
-        # Its plants would hide the new one.
+        # Its plants would override the new one.
         warnings.append(
             f"the plants of {len(before.grid.nodes)} places that the machine had for axis {axis} "
             "are left out: they belong to the former measurement; measure there again (FILE@z=150)"
@@ -156,13 +156,13 @@ def _with_what_is_known(base: Machine, axis: Axis, found: AxisIdentification) ->
 
 
 def _same_filament(mass: MassSchedule, base: Machine) -> MassSchedule:
-    """Return the mass with the density of what the machine prints with, if that is known."""
+    """Return the mass with the density of the machine's filament, if known."""
     known = [s.mass.filament_density_g_cm3 for s in base.schedules.values() if s.mass]
     return mass.model_copy(update={"filament_density_g_cm3": known[0]}) if known else mass
 
 
 def _same_modes(mass: MassSchedule, before: PlantSpec, now: PlantSpec) -> MassSchedule | None:
-    """Return the mass for the resonances that are nearest to those it lowered before."""
+    """Return the mass schedule for the resonances nearest to those it lowered before."""
     were, are = resonances_hz(before), resonances_hz(now)
     if not len(are):
         return None

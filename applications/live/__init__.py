@@ -1,1 +1,1 @@
-"""The compensation for print time: inside Klipper."""
+"""Compensation at print time, inside Klipper."""

@@ -68,14 +68,14 @@ def check_before_job(
     max_age_days: float,
     config: PrinterConfig | None = None,
 ) -> list[str]:
-    """Return what speaks against using a machine now, one line each; nothing is all well.
+    """Return reasons against using a machine now, one line each; empty if there are none.
 
     Parameters
     ----------
     machine : Machine
     now : datetime
     max_age_days : float
-        How long a measurement counts.
+        Largest age of a measurement.
     config : PrinterConfig, optional
         The printer's configuration as it is now.
     """
@@ -86,7 +86,7 @@ def check_before_job(
 def age_warnings(machine: Machine, now: datetime, max_age_days: float) -> list[str]:
     """Return a line for each axis whose plants are old, undated or were never measured.
 
-    Axes without provenance (the built-in machines) are not judged.
+    Axes without provenance (the built-in machines) are not checked.
     """
     found = []
     for axis in ("x", "y"):
@@ -112,8 +112,8 @@ def differences(machine: Machine, config: PrinterConfig) -> list[Difference]:
     Raises
     ------
     ModelError
-        If the configuration lacks what Klipper requires, or holds words for numbers; if the
-        machine is no Klipper machine.
+        If the configuration lacks what Klipper requires or has text in place of numbers, or if the
+        machine is not a Klipper machine.
     """
     if machine.firmware.kind != "klipper":
         raise ModelError(
@@ -142,7 +142,7 @@ def differences(machine: Machine, config: PrinterConfig) -> list[Difference]:
 
 @dataclass(frozen=True, slots=True)
 class StatedMachine:
-    """What somebody says of a machine before it is measured.
+    """What is known of a machine before it is measured.
 
     Attributes
     ----------
@@ -164,19 +164,19 @@ class StatedMachine:
 def machine_from_config(config: PrinterConfig, stated: StatedMachine) -> Machine:
     """Return a machine with the facts of a printer.cfg and plants that were not measured.
 
-    The plants are one resonance each with a wide set around it, marked as typed in; a measurement
-    takes their place.
+    Each plant is one resonance with a wide set around it, marked as typed in, to be replaced by a
+    measurement.
 
     Parameters
     ----------
     config : PrinterConfig
     stated : StatedMachine
-        Without resonances the input shaper's frequencies count, else 50 Hz.
+        Without resonances the input shaper's frequencies are used, else 50 Hz.
 
     Raises
     ------
     ModelError
-        If the configuration lacks something or is not of a machine we know.
+        If the configuration lacks something, or is of an unknown kind of machine.
     """
     document: dict[str, Any] = {
         "name": stated.name,
@@ -201,7 +201,7 @@ def machine_from_config(config: PrinterConfig, stated: StatedMachine) -> Machine
 
 
 def _refuse_limits_by_axis(config: PrinterConfig) -> None:
-    """Refuse a fork's kinematics whose limits by axis no stream may raise (Kalico, 2026)."""
+    """Refuse a fork's kinematics with fixed limits by axis (Kalico, 2026)."""
     kinematics = config.text("printer", "kinematics") or ""
     plain = kinematics.removeprefix("limited_")
     if plain == kinematics:
@@ -218,7 +218,7 @@ def _refuse_limits_by_axis(config: PrinterConfig) -> None:
 
 
 def not_followed(config: PrinterConfig) -> list[str]:
-    """Return a warning for each file that the configuration includes, as none is read."""
+    """Return a warning for each included file, as these are not read."""
     return [
         f"[include {name}] in {config.name}: not followed; its contents were not checked"
         for name in config.includes
@@ -226,21 +226,21 @@ def not_followed(config: PrinterConfig) -> list[str]:
 
 
 def stated_axis(f_hz: float, zeta: float) -> dict[str, Any]:
-    """Return an axis of one resonance that nobody measured; without a frequency (0) it is 50 Hz."""
+    """Return an unmeasured axis of one resonance; without a frequency (0), of 50 Hz."""
     return typed_in(f_hz or _DEFAULT_HZ, zeta).model_dump(mode="json", exclude_none=True)
 
 
 def derived_envelope(machine: Machine) -> CommandLimits:
     """Return the limits assumed for the motors, from those that the printer sets for a file.
 
-    A little more than that, since a command has to lead the nozzle; who knows more says so in the
-    machine's `command`. Where the printer states X and Y apart, so do `axes`; the motors of a
-    CoreXY are taken to bear what a file's diagonals ask of them.
+    They are slightly higher, since a command has to lead the nozzle; the machine's `command` can
+    state better values. `axes` are set if the printer has separate limits for X and Y; the motors
+    of a CoreXY are assumed to follow what a file's diagonals need.
     """
     x, y = (_borne(machine.firmware.allowance(axis)) for axis in ("x", "y"))
     least = {name: min(value, y[name]) for name, value in x.items()}
     if machine.kinematics == "corexy":
-        # Whole, and not below what a diagonal at the head's own limit asks.
+        # An integer, not below what a diagonal at the head's own limit needs.
         accel = math.ceil(_ACCEL_ROOM * machine.firmware.motor_accel_mm_s2())
         return CommandLimits(**least, motors=MotorLimits(accel_mm_s2=accel))
     if machine.firmware.kind == "klipper":
@@ -265,12 +265,12 @@ def _borne(allowed: AxisAllowance) -> dict[str, float]:
 def with_firmware(machine: Machine, section: dict[str, Any]) -> Machine:
     """Return a machine with another firmware section.
 
-    What the motors bear is derived anew where it was derived, and stays where somebody said it.
+    Limits of the motors are derived again if they were derived, and kept if they were stated.
 
     Raises
     ------
     ValidationError
-        If the section, or the machine with it, is none.
+        If the section, or the machine with it, is invalid.
     """
     document = {**machine.model_dump(mode="json"), "firmware": section}
     derived = machine.command == derived_envelope(machine)
@@ -281,7 +281,7 @@ def with_firmware(machine: Machine, section: dict[str, Any]) -> Machine:
 
 
 def envelope_warnings(machine: Machine) -> list[str]:
-    """Return a line if a command may ask for more than the printer's own limits suggest.
+    """Return a warning if a command may exceed what the printer's own limits suggest.
 
     Until 2026-11 machines were made with 20 000 mm/s2 whatever the printer's limit was.
     """

@@ -45,7 +45,7 @@ def diff(old: Machine, new: Machine) -> tuple[Change, ...]:
 
 
 def _plants(place: str, axis: str, old: PlantSetSpec, new: PlantSetSpec) -> Iterator[Change]:
-    """Tell two nominal plants apart by their modes, then by their zeros."""
+    """Yield the differences of two nominal plants: by modes, then by zeros."""
     if old.nominal == new.nominal:
         return
     told = [
@@ -78,7 +78,7 @@ def _pair_text(a: Resonance | None, b: Resonance | None) -> str:
 
 
 def _values(place: str, old: Any, new: Any) -> Iterator[Change]:
-    """Walk through two documents and tell the leaves that differ."""
+    """Yield the differing leaves of two documents."""
     if isinstance(old, dict) and isinstance(new, dict):
         for key in sorted(old.keys() | new.keys()):
             inner = f"{place}.{key}" if place else key
@@ -93,7 +93,7 @@ def _values(place: str, old: Any, new: Any) -> Iterator[Change]:
 
 
 def _lists(place: str, old: list[Any], new: list[Any]) -> Iterator[Change]:
-    """Tell lists of documents (members, modes, files) by their number, not entry by entry."""
+    """Compare lists of documents (members, modes, files) by length, not entry by entry."""
     if old == new:
         return
     changed = sum(a != b for a, b in zip(old, new, strict=False))
@@ -115,7 +115,7 @@ def _percent(old: float, new: float) -> float:
 
 
 def _shown(mode: Resonance) -> tuple[float, float]:
-    """Return what is left of a mode at nine digits: the rest is rounding."""
+    """Return a mode rounded to nine digits."""
     return float(f"{mode[0]:.8e}"), float(f"{mode[1]:.8e}")
 
 

@@ -1,6 +1,6 @@
 """Storage of small documents by name: its interface, and a folder that implements it.
 
-`service.database.documents` is the other, for several computers.
+`service.database.documents` is another implementation, for several computers.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ __all__ = ["DocumentFolder", "Documents"]
 
 
 class Documents(Protocol):
-    """Texts by path (``folder/name``), written whole or not at all, by several at once.
+    """Texts by path (``folder/name``), written atomically, with concurrent writers.
 
     Paths are made by the program, never by a caller.
     """
@@ -43,14 +43,14 @@ class Documents(Protocol):
         ----------
         path, text : str
         beside : str, optional
-            Another document, without which this one would make no sense.
+            Another document that must exist.
 
         Raises
         ------
         FileExistsError
             If `path` is taken; of several callers one succeeds.
         FileNotFoundError
-            If `beside` is not there (any more).
+            If `beside` does not exist.
         """
 
     def create_folder(self, folder: str, contents: Mapping[str, str]) -> None:
@@ -77,7 +77,7 @@ class Documents(Protocol):
         """Write a document, over an earlier one if there is one."""
 
     def place(self, path: str) -> str:
-        """Return how to name a document, or a folder, to a person."""
+        """Return the name of a document or folder as shown to users."""
 
 
 class DocumentFolder:
@@ -115,7 +115,7 @@ class DocumentFolder:
             file.parent.mkdir(parents=True, exist_ok=True)
         publish(file, text)
         if beside is not None and not (self._root / beside).exists():
-            # The folder was moved away and made anew meanwhile: this does not belong into that one.
+            # The folder was moved and recreated meanwhile, and this does not belong in the new one.
             file.unlink(missing_ok=True)
             raise FileNotFoundError(f"{self._root / beside} is gone")
         sync_folder(self._root)
@@ -148,7 +148,7 @@ class DocumentFolder:
 
     def _move(self, folder: Path, target: str) -> None:
         try:
-            # Fails on a folder that holds a document already, whoever put it there.
+            # Fails if the target folder already contains a document.
             folder.rename(self._root / target)
         except FileNotFoundError:
             raise

@@ -43,7 +43,7 @@ def drift(history: Sequence[Revision], *, since: date | None = None) -> tuple[Dr
         Oldest first. A measurement is dated by `measured_on` of its provenance, otherwise by its
         revision; plants that were typed in are none.
     since : date, optional
-        Leave measurements of before out: after a rebuild, a machine is another one.
+        Ignore earlier measurements, for instance from before a rebuild.
     """
     found = (_of_axis(axis, history, since) for axis in ("x", "y"))
     return tuple(entry for entry in found if entry is not None)
@@ -85,8 +85,8 @@ def _of_axis(axis: str, history: Sequence[Revision], since: date | None) -> Drif
 def _measurements(axis: str, history: Sequence[Revision]) -> list[tuple[Revision, date]]:
     """Return the revisions that brought a new measurement of the axis, with its day.
 
-    Nominal plants of machines whose plant follows the place are of some place in the middle: they
-    are not compared with others.
+    Machines whose plant depends on position are skipped: their nominal plants are of some position
+    in the middle.
     """
     found = []
     for earlier, revision in pairwise([None, *history]):

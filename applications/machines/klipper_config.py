@@ -1,4 +1,4 @@
-"""Reads the motion settings of a Klipper printer.cfg; nothing is executed, no include followed.
+"""Read the motion settings of a Klipper printer.cfg; includes are not followed.
 
 Rules and defaults are those of klippy/configfile.py, toolhead.py, kinematics/extruder.py,
 extras/input_shaper.py, firmware_retraction.py and gcode_arcs.py (2024 to 2026).
@@ -48,7 +48,7 @@ class PrinterConfig:
     Attributes
     ----------
     includes : tuple of str
-        Files that it includes, which were not read: what stands there is not known.
+        Included files, which were not read, so that their contents are unknown.
     """
 
     name: str
@@ -134,7 +134,7 @@ def parse_printer_config(text: str, name: str) -> PrinterConfig:
 def facts(config: PrinterConfig) -> list[Fact]:
     """Return the facts of a configuration, with Klipper's defaults for missing ones.
 
-    Sections that are missing altogether while other files are included say nothing.
+    If other files are included, sections that are missing altogether yield no facts.
     """
     known = [_printer, _travel, _extruder, _shaper, _retraction, _arcs]
     return [fact for find in known for fact in find(config)]
@@ -155,7 +155,7 @@ def _parse(
         line = indented.lstrip()
         indent = len(indented) - len(line)
         if not line or (begun_at is not None and indent > begun_at):
-            continue  # lines that go on, of macros and lists, say nothing about motion
+            continue  # continuation lines of macros and lists do not concern motion
         begun_at = None
         if section := _SECTION.match(line):
             name = section["name"].strip()

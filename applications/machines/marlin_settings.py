@@ -1,4 +1,4 @@
-"""Reads Marlin's answer to M503 as the firmware section of a machine."""
+"""Read Marlin's reply to M503 as the firmware section of a machine."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ ASSUMED = {
     "block_buffer_size": 16,
     "s_curve": False,
 }
-"""What M503 does not say, and a stream depends on; the figures are those of most builds."""
+"""Settings that a stream depends on but M503 does not report, as in most builds."""
 
 _COMMAND = re.compile(r"(M\d{2,3})((?:\s+[A-Z](?:-?\d+(?:\.\d*)?)?)+)\s*(?:;.*)?$")
 _WORD = re.compile(r"([A-Z])(-?\d+(?:\.\d*)?)?")
@@ -51,7 +51,7 @@ _PLANNER: dict[str, tuple[str, str] | tuple[str, str, float]] = {
     "min_feedrate_mm_s": ("M205", "S", 0.0),
     "min_travel_feedrate_mm_s": ("M205", "T", 0.0),
 }
-"""Command and word of a planner's numbers, and what they are where the word is not printed."""
+"""Command and word of each planner limit, and its value if the word is not printed."""
 
 
 def looks_like_m503(text: str) -> bool:
@@ -65,8 +65,8 @@ def firmware_section(text: str, name: str) -> dict[str, Any]:
     Parameters
     ----------
     text : str
-        What the printer sent, or a host's log of it; of a command that stands there twice the
-        later words count, of several tools the first.
+        The printer's reply, or a host's log of it; of repeated commands the last counts, of several
+        tools the first.
     name : str
         The file, for messages.
 
@@ -135,16 +135,16 @@ def machine_from_m503(
     text, file : str
         What the printer answered, and the name of the file it stands in.
     stated : StatedMachine
-        Without resonances those of the firmware's shaper (M593) count, else 50 Hz.
+        Without resonances those of the firmware's shaper (M593) are used, else 50 Hz.
     travel_mm : sequence of float
-        How far X, Y and Z reach from 0.
+        Travel of X, Y and Z from 0.
     fields : sequence of str
         ``FIELD=VALUE`` of the firmware section that M503 does not say.
 
     Raises
     ------
     ModelError
-        If something is missing, or is none of a machine.
+        If something is missing or invalid.
     """
     section = {**ASSUMED, **firmware_section(text, file)}
     shaper = section["shaper"]

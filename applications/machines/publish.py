@@ -1,4 +1,4 @@
-"""Writes files once: whole or not at all, and never over another."""
+"""Write files atomically and exactly once, never replacing another."""
 
 from __future__ import annotations
 
@@ -16,9 +16,8 @@ _ABANDONED_S = 3600.0
 def publish(target: Path, text: str) -> None:
     """Write `target`, synced to disk, unless it exists.
 
-    The text goes to a file beside it, which is then linked to its name: that fails if somebody
-    else was faster, and a process that is killed leaves at most a `.part` file, which a later
-    call sweeps.
+    The text is written to a temporary file, which is then linked to its name: that fails if another
+    process was faster. A killed process leaves at most a `.part` file, which a later call deletes.
 
     Raises
     ------
@@ -59,7 +58,7 @@ def _take_name(temporary: Path, target: Path) -> None:
 
 
 def _sweep(folder: Path) -> None:
-    """Delete what killed writers left; a writer at work is much younger."""
+    """Delete old files of killed writers; those of active writers are much younger."""
     oldest = time.time() - _ABANDONED_S
     for part in folder.glob(".*.part"):
         with contextlib.suppress(FileNotFoundError):

@@ -1,4 +1,4 @@
-"""Finds a machine by its name: built in, the user's own, or a file."""
+"""Find a machine by its name: built in, the user's own, or a file."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class PinnedMachine(BaseModel):
 
 
 class Resolver:
-    """Finds machines by name. Names of built-in machines are reserved, so no name means two.
+    """Finds machines by name. Names of built-in machines are reserved, so names are unique.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ class Resolver:
     require_approval : bool
         Jobs use approved revisions only. Built-in machines count as approved.
     max_age_days : float
-        How long a measurement counts.
+        Largest age of a measurement.
     """
 
     def __init__(

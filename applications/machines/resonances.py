@@ -13,7 +13,7 @@ Resonance = tuple[float, float]
 """Frequency (Hz) and damping ratio."""
 
 _SAME = 0.3
-"""Frequencies further apart than this are of different modes."""
+"""Relative distance above which frequencies belong to different modes."""
 
 
 def resonances(plant: PlantSpec, *, zeros: bool = False) -> list[Resonance]:
@@ -24,7 +24,7 @@ def resonances(plant: PlantSpec, *, zeros: bool = False) -> list[Resonance]:
 
 
 def leading(plant: PlantSpec) -> Resonance | None:
-    """Return the mode that a machine shows most: the largest |G|^2 f zeta (area of its peak)."""
+    """Return the dominant mode: the largest |G|^2 f zeta (area of its peak)."""
     modes = resonances(plant)
     if not modes:
         return None
@@ -35,7 +35,7 @@ def leading(plant: PlantSpec) -> Resonance | None:
 def matched(
     old: list[Resonance], new: list[Resonance]
 ) -> list[tuple[Resonance | None, Resonance | None]]:
-    """Return old and new modes in pairs, nearest frequencies first; None for what has no other."""
+    """Return old and new modes in pairs, nearest first; None where there is no counterpart."""
     gaps = sorted(
         (abs(np.log(b[0] / a[0])), i, j) for i, a in enumerate(old) for j, b in enumerate(new)
     )

@@ -1,4 +1,4 @@
-"""Settings of the user's machines, and where they lie, for the command line and the service."""
+"""Settings and location of the user's machines, for the command line and the service."""
 
 from __future__ import annotations
 

@@ -6,9 +6,9 @@
     machines/NAME/000001.approved.json   that it may be used
     machines/.trash/NAME/TIME/           a machine that was deleted
 
-Every document is written once (`applications.machines.documents`: files, or rows of a database), so
-nothing points anywhere: the newest revision is the current one, and a process that is killed leaves
-the state before or after.
+Every document is written once (`applications.machines.documents`: files, or rows of a database).
+There are no pointers: the newest revision is the current one, and a killed process leaves either
+the old or the new state.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class MachineStore:
     Parameters
     ----------
     place : Path or Documents
-        Where they lie; a folder is made when the first machine is added.
+        Storage of the machines; a folder is made for the first machine.
 
     Notes
     -----
@@ -178,7 +178,7 @@ class MachineStore:
     ) -> Revision:
         """Store a ring test's verdict on axes, on top of whatever else has changed.
 
-        If that is a change of the plants, the confirmation names those it was of, and is stale.
+        If the plants changed meanwhile, the confirmation refers to the old ones and is stale.
         """
         self._existing(name)
         fields = {"author": author, "message": message, "sources": tuple(sources)}
@@ -217,7 +217,7 @@ class MachineStore:
         message: str = "",
         when: datetime | None = None,
     ) -> Approval:
-        """Say that a revision may be used; an approval that stands already is returned."""
+        """Approve a revision for use; an existing approval is returned."""
         revision = self.revision(name, number)
         approval = Approval.of(
             revision, when=when or datetime.now(UTC), author=author, message=message
@@ -292,7 +292,7 @@ class MachineStore:
         when: datetime | None = None,
         expected: int | None = None,
     ) -> Revision:
-        """Write the revision that `change` makes of the current one, once more if it is late."""
+        """Write the revision that `change` makes of the current one; retry after a conflict."""
         check_name(name)
         for _ in range(_ATTEMPTS):
             numbers = self._revision_numbers(name)
@@ -332,13 +332,13 @@ class MachineStore:
         return numbers
 
     def _revision_numbers(self, name: str) -> list[int]:
-        # A name only: a path must not reach the file system from outside.
+        # Accept names only: paths from outside must not reach the file system.
         if not _NAME.fullmatch(name):
             return []
         return _numbers(self._documents.names(name), _REVISION)
 
     def _listed(self, name: str, number: int) -> Revision:
-        """Read a revision that must be there: numbers have no gaps."""
+        """Read a revision that must exist, as numbers have no gaps."""
         try:
             return self._read_revision(name, number)
         except _Gone:
@@ -401,9 +401,9 @@ def check_name(name: str) -> None:
     Raises
     ------
     Conflict
-        If a built-in machine is called so.
+        If it is the name of a built-in machine.
     ModelError
-        If no machine may be.
+        If it is not a valid name.
     """
     if not _NAME.fullmatch(name):
         raise ModelError(

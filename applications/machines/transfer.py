@@ -1,4 +1,4 @@
-"""Machines in files: a document, or the whole history, out of a store and into another."""
+"""Export and import machines as files: a document, or the whole history."""
 
 from __future__ import annotations
 

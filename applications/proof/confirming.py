@@ -1,7 +1,6 @@
-"""Judges the plants of a machine by logs of a ring test: confirmed, not confirmed, or neither.
+"""Judge the plants of a machine by logs of a ring test: confirmed, not confirmed, or undecided.
 
-A log that does not hold the motion of the file, or too little of it above its own noise, says
-nothing; only one that does can speak for or against the plants.
+A log counts only if it contains the motion of the file, and enough of it above its own noise.
 """
 
 from __future__ import annotations
@@ -55,17 +54,17 @@ _RINGS = 0.3
 _HIGHEST_HZ = 200.0
 _MATCHED, _CORRELATED = 0.5, 0.8
 _GAINS = (0.6, 1.6)
-"""A sensor may be 16 % off, and frames that shake by reaction make some 30 % more of it."""
+"""A sensor may be 16 % off, and a frame excited by reaction adds up to about 30 %."""
 _FEWEST_STOPS, _SEEN_SHARE = 4, 0.7
 _ABOVE_FLOOR = 3.0
 _SIGMAS = 2.0
 _LEAST_GAIN = 2.0
-"""By how much compensation must lower the vibration."""
+"""Factor by which compensation must lower the vibration."""
 _MOST_MISSES = 0.35
 _NEAR, _SURE = 0.01, 3.0
-"""A mode counts as moved beyond both: this share, and so many standard deviations."""
+"""A mode counts as moved if beyond both this share and this many standard deviations."""
 _MOST_APART_S = 5e-4
-"""Between the delays of X and Y: at 100 mm/s that bends corners by 50 um."""
+"""Largest difference of the delays of X and Y: at 100 mm/s it distorts corners by 50 um."""
 _ANEW = "measure the machine again (`stillpath identify`) and write a new ring test"
 _PHASE = (
     "The mode that rings most is where the plants have it, so its phase, its damping or other "
@@ -151,7 +150,7 @@ class _Level:
 
     @property
     def scatter(self) -> float:
-        """Of the rms; that of a rms of 0 is what could hide in the noise."""
+        """Standard error of the rms; for an rms of 0, what could be hidden in the noise."""
         return float(np.sqrt(max(self.power, 0.0) + self.error)) - self.rms
 
     def reaches(self, sigmas: float) -> float:
@@ -159,7 +158,7 @@ class _Level:
 
 
 class _Axis:
-    """What all logs say of one axis, together."""
+    """The combined evidence of all logs about one axis."""
 
     def __init__(self, machine: Machine, motion: RingMotion, axis: Axis, today: date) -> None:
         self._machine, self._motion, self._axis, self._today = machine, motion, axis, today
@@ -174,7 +173,7 @@ class _Axis:
         self._logs: list[AxisLog] = []
 
     def add_reason(self, reason: str) -> None:
-        """Add why a log does not judge the axis."""
+        """Add a reason why a log cannot judge the axis."""
         self._reasons.append(reason)
 
     def add(self, source: SourceFile, log: AxisLog | None) -> None:
@@ -231,7 +230,7 @@ class _Axis:
         )
 
     def _unusable(self, name: str, log: AxisLog | None) -> str:
-        """Return why a log says nothing of the axis; empty: it does."""
+        """Return why a log is unusable for the axis; empty if it is usable."""
         axis = self._axis.upper()
         if log is None:
             return f"{name} was not taken while the file moved {axis}"
@@ -327,9 +326,9 @@ class _Axis:
         return "confirmed", said
 
     def _moved(self) -> str:
-        """Say where the log has the mode that rings most, if no plant of the set has it there.
+        """Return a text on the dominant mode in the log if no plant of the set has it there.
 
-        What rings after compensated stops may be small also where the frequency is not right.
+        Ringing after compensated stops may be small even if the frequency is wrong.
         """
         log = self._logs[0]
         rows = np.flatnonzero(log.inside)
@@ -368,7 +367,7 @@ class _Axis:
 
 
 def _delays_compared(axes: list[AxisRing]) -> list[AxisRing]:
-    """Take back what was confirmed if the axes of one log are late by different times.
+    """Revoke a confirmation if the axes of one log have different delays.
 
     One axis alone does not show it, as the start of the log is unknown.
     """
@@ -413,7 +412,7 @@ def _level(stops: Array, noise: Array, kinds: list[int]) -> _Level:
 
 
 def _standard_error(values: Array, kinds: list[int]) -> float:
-    """Of the mean of values that are repeats where their kinds are the same."""
+    """Return the standard error of the mean of values, where equal kinds are repeats."""
     kind = np.array(kinds)
     groups = np.unique(kind)
     free = len(values) - len(groups)

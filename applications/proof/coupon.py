@@ -114,9 +114,9 @@ def _legend(
 
 
 def _outline() -> list[Point]:
-    """From the back wall: inner wall, front, outer wall, back with teeth.
+    """Return the outline from the back wall: inner wall, front, outer wall, back with teeth.
 
-    It ends on a straight line, where what is left of the motion at the stop does not show.
+    It ends on a straight line, where residual motion at the stop is not visible.
     """
     side = _SIDE_MM
     first = 0.5 * (side - _TEETH * _TOOTH_MM)

@@ -18,9 +18,9 @@ _WAVE_MM = (2.0, 6.0)
 """Ripples of this length show best on a wall."""
 _WAVE_WANTED_MM = 3.5
 _LARGEST_UM = 150.0
-"""More than this says nothing more, and the compensator may find no command."""
+"""More is not more informative, and the compensator may find no command."""
 _DAMPED = 0.25
-"""Above this damping ratio nothing is seen to ring."""
+"""Damping ratio above which ringing is not visible."""
 _LOWEST_MM_S, _LOWEST_MM_S2 = 25.0, 300.0
 
 
@@ -61,7 +61,7 @@ class RingingMode:
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """How walls are printed, and the ringing that one mode makes of it without compensation."""
+    """Speed and acceleration of walls, and the uncompensated ringing of one mode."""
 
     speed_mm_s: float
     accel_mm_s2: float
@@ -101,9 +101,9 @@ def drive(machine: Machine, modes: Sequence[RingingMode], flow_mm_s: float, run_
     modes : sequence of RingingMode
         One per axis.
     flow_mm_s : float
-        Fastest that the hotend follows.
+        Fastest speed of the hotend.
     run_mm : float
-        Length in which the speed must be reached and lost again.
+        Length within which to accelerate and brake.
     """
     best: tuple[tuple[float, ...], Drive] | None = None
     for accel in _accelerations(machine, modes):
@@ -127,14 +127,14 @@ def drive(machine: Machine, modes: Sequence[RingingMode], flow_mm_s: float, run_
 def bands(
     machine: Machine, mode: RingingMode, flow_mm_s: float, run_mm: float, count: int
 ) -> list[Drive]:
-    """Return speeds and accelerations that rise from band to band, each ringing as it can."""
+    """Return speeds and accelerations that rise from band to band, each with maximal ringing."""
     top = _accelerations(machine, [mode])[-1]
     accels = _rounded(np.geomspace(max(top / count, min(_LOWEST_MM_S2, top)), top, count))
     fastest = _fastest(machine, flow_mm_s, run_mm, accels[0])
     edges = np.linspace(0.5 * fastest, _fastest(machine, flow_mm_s, run_mm, top), count + 1)
     out = []
     for accel, low, high in zip(accels, edges[:-1], edges[1:], strict=True):
-        # Inside its share of the speeds, where the steps of acceleration do not cancel.
+        # A speed within the band's range at which the acceleration steps do not cancel.
         speeds = np.linspace(low, high, 21)[1:]
         rings = [mode.ringing_um(v, accel) for v in speeds]
         k = int(np.argmax(rings))
@@ -143,7 +143,7 @@ def bands(
 
 
 def _accelerations(machine: Machine, modes: Sequence[RingingMode]) -> list[float]:
-    """Rising accelerations up to the machine's own, or what rings as much as can be used."""
+    """Return rising accelerations up to the machine's own, or up to the largest useful ringing."""
     largest = machine.firmware.largest_accel_mm_s2
     useful = min(_LARGEST_UM / mode.um_per_mm_s2 for mode in modes)
     top = min(largest, max(useful, _LOWEST_MM_S2))
@@ -170,7 +170,7 @@ def _fastest(machine: Machine, flow_mm_s: float, run_mm: float, accel: float) ->
 
 
 def _legible(speed_mm_s: float, modes: Sequence[RingingMode]) -> float:
-    """Between 0 and 1: how near the ripples are to lengths that show on a wall."""
+    """Return, from 0 to 1, how well ripples of this length show on a wall."""
     worst = 1.0
     for mode in modes:
         wave = speed_mm_s / mode.f_hz

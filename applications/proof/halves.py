@@ -1,7 +1,7 @@
-"""Prints of two halves, left as planned and right compensated, and the errors of each half.
+"""Build prints of two halves, the left as planned and the right compensated.
 
-Both halves are mirror images, drawn outwards from the gap between them, so that the same walls are
-reached by the same corners. The right one is compensated by the pipeline itself, as any file is.
+Both halves are mirror images, drawn outwards from the gap between them, so that equal walls follow
+equal corners. The right one is compensated by the pipeline itself, like any file.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _GAP_MM, _RIM_MM, _PURGE_MM = 10.0, 4.0, 5.0
 
 
 class Halves:
-    """Lay two mirrored halves on the bed and write what both share.
+    """Places two mirrored halves on the bed and writes what both share.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ class Halves:
         program.region(band + AS_PLANNED)
         for path in paths:
             program.trace([self._at(point, -1) for point in path], speed_mm_s)
-        # The right half must not begin in the vibration of the left one.
+        # The left half's vibration must decay before the right half begins.
         program.stand(self._settling_s)
         program.region(band + COMPENSATED)
         with program.compensated():
@@ -147,7 +147,7 @@ class ProofPrint:
     ringing : dict of str to Ringing
         By region.
     legend : list of str
-        What stands in the file's first comments.
+        First comments of the file.
     warnings : list of str
     """
 
@@ -158,7 +158,7 @@ class ProofPrint:
 
 
 class Written(Protocol):
-    """Whatever has lines."""
+    """Anything that can be written as lines."""
 
     def text(self) -> str:
         """Return all lines."""
@@ -178,7 +178,7 @@ def write_proof(
     Parameters
     ----------
     legend : callable
-        Lines for a person, from the predictions.
+        Makes lines for users from the predictions.
     cache_dir, progress
         As of `pipeline.compensate.compensate_file`.
 
@@ -203,7 +203,7 @@ def write_proof(
 
 
 def _ringing(result: Result) -> dict[str, Ringing]:
-    """By region, as the written file makes it."""
+    """Return the ringing of the written file by region."""
     return {
         group.name: Ringing(group.contour_rms_um["after"], group.contour_max_um["after"])
         for group in result.features

@@ -1,4 +1,4 @@
-"""One axis of a log against its prediction: how far off, at which frequency, and a verdict.
+"""Judge one axis of a log against its prediction: deviation, frequency, and a verdict.
 
 The command's acceleration is known, so the axis can be identified from the print itself: all its
 frequencies and damping ratios are scaled until the predicted spectrum fits the measured one, the
@@ -33,11 +33,11 @@ _CORNER_S = (0.02, 0.12)
 _FREQUENCY_TOLERANCE, _DAMPING_TOLERANCE, _GAIN_TOLERANCE = 0.01, 0.35, 0.15
 _SIGMAS = 3.0
 _OWN_SHIFT = 0.03
-"""How far one mode is expected to move against the others."""
+"""Expected shift of one mode relative to the others."""
 _QUIET, _FEWEST_CORNERS = 0.05, 5
 _POOR_NRMSE = 0.4
 _VAGUE = 0.03
-"""A frequency known no better than this says nothing about the model."""
+"""Uncertainty above which a frequency does not judge the model."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ def judge(axis: AxisMotion, dt_s: float) -> AxisReadback:
     n = len(axis.measured)
     window = tukey(n, 0.02)
     f = np.asarray(np.fft.rfftfreq(n, dt_s), np.float64)
-    # A second difference sees acceleration through a triangle of two samples.
+    # A second difference averages acceleration over a triangle of two samples.
     correction = 1.0 / np.maximum(np.sinc(f * dt_s) ** 2, 0.1)
     top_hz = min(_BAND_HZ[1], 0.4 / dt_s)
     band = (f >= _BAND_HZ[0]) & (f <= top_hz)
@@ -145,7 +145,7 @@ def _fit(
 
         def residual(x: Array, sd: Array = sd) -> Array:
             e = (model(x) - measured) / sd
-            # Without other modes the data cannot tell both factors apart.
+            # Without other modes the data cannot separate both factors.
             return np.concatenate([e.real, e.imag, [x[4] / _OWN_SHIFT]])
 
         solved = least_squares(residual, x, bounds=limits, x_scale=[0.01, 0.1, 0.05, 0.1, 0.01])
@@ -169,7 +169,7 @@ def _fit(
 
 
 def _verdict(axis: str, mode: RingingMode, fit: _Fit, missing: float) -> tuple[str, bool]:
-    """Say in words what was found, and whether the model holds."""
+    """Return the verdict as text, and whether the model holds."""
     f_hz, sd_hz = mode.f_hz * fit.frequency, mode.f_hz * fit.frequency_sd
     hz = f"{f_hz:.2f} ± {max(sd_hz, 0.01):.2f} Hz, model {mode.f_hz:.2f} Hz"
     change = fit.frequency - 1.0
@@ -206,16 +206,16 @@ def _power(x: Spectrum) -> float:
 
 
 def _wave(x: Spectrum, band: NDArray[np.bool_], n: int) -> Array:
-    """Return a band of a spectrum back in time."""
+    """Return a band of a spectrum as a time signal."""
     full = np.zeros(len(band), complex)
     full[band] = x
     return np.fft.irfft(full, n)
 
 
 def _corner_samples(command: Array, dt_s: float) -> NDArray[np.int64]:
-    """Return the samples at which the command comes out of its strongest changes of speed.
+    """Return the samples at which the strongest speed changes of the command end.
 
-    Those after which it is quiet, if there are some: compensated motion is never quite.
+    Preferably those followed by quiet motion, but compensated motion is never entirely quiet.
     """
     change = uniform_filter1d(np.abs(command), max(1, round(0.01 / dt_s)))
     strongest = float(np.quantile(change, 0.99))
@@ -223,7 +223,7 @@ def _corner_samples(command: Array, dt_s: float) -> NDArray[np.int64]:
     ends = np.flatnonzero(strong[:-1] & ~strong[1:]) + 1
     first, last = (round(s / dt_s) for s in _CORNER_S)
     ends = ends[ends + last < len(command)]
-    # A corner counts if no other one follows before its vibration was seen.
+    # A corner counts if its vibration can be seen before the next one.
     ends = ends[np.append(np.diff(ends) > last, True)[: len(ends)]]
     total = np.concatenate([[0.0], np.cumsum(np.abs(command))])
     quiet = total[ends + last] - total[ends + first] < _QUIET * strongest * (last - first)

@@ -1,4 +1,4 @@
-"""Finds the part of a print that an accelerometer log covers, and how the sensor was mounted.
+"""Find the part of a print that an accelerometer log covers, and the sensor's mounting.
 
 The nozzle's predicted acceleration p (x, y) and the log m (three columns) are related by
 m(t) = D p(t + lag) + noise with unknown 3 x 2 matrix D and a lag that drifts with the clocks. Below
@@ -36,7 +36,7 @@ _REACH_S = 0.2
 _FOLLOWS = 0.5
 """A segment follows the plan if this share of its power is explained."""
 _JUMP_S = 4e-3
-"""Between segments a clock drifts less than this; more is a pause that the plan has not."""
+"""Largest clock drift between segments; more is a pause that is not in the plan."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +104,7 @@ def read_log(path: Path, otherwise: str) -> AccelerationLog:
     ----------
     path : Path
     otherwise : str
-        What to do instead of giving a file of another kind.
+        Advice in the message about a file of another kind.
 
     Raises
     ------
@@ -219,7 +219,7 @@ def _explained(plan: Array, window: Array) -> Array:
         return np.asarray(total[n:] - total[:-n])
 
     xx, xy, yy = sums(plan[0] ** 2), sums(plan[0] * plan[1]), sums(plan[1] ** 2)
-    # Where the plan hardly moves nothing is explained by chance.
+    # Avoid chance matches where the plan hardly moves.
     floor = 1e-3 * float(np.max(xx + yy)) + 1e-12
     xx, yy = xx + floor, yy + floor
     cx, cy = cross[:, 0], cross[:, 1]

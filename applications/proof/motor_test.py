@@ -1,8 +1,8 @@
-"""A search for lost steps: motions of a stream at rising limits, and reading the console's answers.
+"""Search for lost steps: stream-like motions at rising limits, and the console's replies.
 
 Each level homes X and Y, moves as streams do (starts, stops and corners, along both axes and both
-motors of a CoreXY) and homes again. Where the host's step counters then differ by a full step from
-what they were at first, a motor has lost some.
+motors of a CoreXY) and homes again. If the host's step counters then differ by a full step from
+their first values, a motor has lost steps.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _COUNTED = re.compile(r"mcu: stepper_x:(-?\d+) stepper_y:(-?\d+)")
 
 @dataclass(frozen=True)
 class Level:
-    """Limits that motors were tried at."""
+    """Limits tried on the motors."""
 
     accel_mm_s2: float
     speed_step_mm_s: float
@@ -67,7 +67,7 @@ def motor_test(machine: Machine, most_accel_mm_s2: float) -> str:
     place = f"G1 X{middle[0]:.3f} Y{middle[1]:.3f} F6000"
     lines = ["; STILLPATH_OFF", "; a search for lost steps: nothing is heated, nothing printed"]
     lines += ["G28", "G90", "M83", f"G1 Z{_HEIGHT_MM:g} F600", *home]
-    # A shaper would spare the motors what a stream asks of them.
+    # A shaper would reduce the load of a stream on the motors.
     lines += stream_commands.shaper_off.decode().splitlines()
     for number, level in enumerate(levels, 1):
         accel, step = level.accel_mm_s2, level.speed_step_mm_s
@@ -98,7 +98,7 @@ def levels_of(text: str) -> list[Level]:
 
 
 def borne(levels: list[Level], console: str, full_step: int) -> int:
-    """Return how many levels the motors passed, from the console's answers.
+    """Return how many levels the motors passed, from the console's replies.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ def envelope(machine: Machine, level: Level, margin: float) -> CommandLimits:
         "speed_step_mm_s": round(margin * level.speed_step_mm_s, 1),
     }
     if machine.command.motors is not None:
-        # The strokes along diagonals ask one motor of a CoreXY for so much.
+        # Strokes along diagonals need this of one motor of a CoreXY.
         accel = round(math.sqrt(2.0) * margin * level.accel_mm_s2)
         changed["motors"] = machine.command.motors.model_copy(update={"accel_mm_s2": accel})
     return machine.command.model_copy(update=changed)
@@ -171,7 +171,7 @@ def _strokes(
     level: Level,
     firmware: Klipper,
 ) -> list[str]:
-    """Go to and fro at all the speed that a length allows; the shortest only start and stop."""
+    """Move back and forth at the top speed of each length; the shortest only start and stop."""
     lines = []
     for share in (1.0, 0.25, 0.05):
         far_mm = share * length_mm

@@ -1,4 +1,4 @@
-"""Turns a `ReadbackReport` into readback.html and readback.json."""
+"""Write a `ReadbackReport` as readback.html and readback.json."""
 
 from __future__ import annotations
 

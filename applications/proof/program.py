@@ -1,4 +1,4 @@
-"""G-code of our own: lines, layers and regions, within the travel, with the extruder right.
+"""Generate G-code: lines, layers and regions within the travel, with correct extrusion.
 
 Everything is written with absolute X Y Z and relative E. Moves are planned (`STILLPATH_OFF`) unless
 a part asks for compensation.
@@ -21,7 +21,7 @@ __all__ = ["Place", "PrintSettings", "Program", "place"]
 Point = tuple[float, float]
 
 _MARGIN_MM = 5.0
-"""Nothing is printed nearer to the end of the travel."""
+"""Least distance of prints from the ends of the travel."""
 _GENTLE_MM_S2 = 2000.0
 _TRAVEL_MM_S = 200.0
 _BASE_MM_S = (50.0, 100.0)
@@ -37,14 +37,14 @@ LETTER_PITCH_MM, LETTER_HEIGHT_MM = 5.0, 5.0
 
 @dataclass(frozen=True, slots=True)
 class PrintSettings:
-    """What the machine's model does not know.
+    """Print settings that are not in the machine's model.
 
     Attributes
     ----------
     max_flow_mm3_s : float
-        What the hotend melts; bounds the speed of walls.
+        Melting rate of the hotend; bounds the speed of walls.
     centre_mm : tuple of float, optional
-        Where the middle of the print lies; None: the middle of the travel.
+        Centre of the print; None: the middle of the travel.
     start_gcode, end_gcode : str, optional
         Instead of the lines that home and heat before the first of ours, and those that switch
         off and park after the last.
@@ -70,7 +70,7 @@ class Place:
 def place(
     machine: Machine, settings: PrintSettings, width_mm: float, depth_mm: float, what: str
 ) -> Place:
-    """Return where a print of this size goes.
+    """Return the place of a print of this size.
 
     Raises
     ------
@@ -110,7 +110,7 @@ class Program:
     section_mm2 : float
         Of a line, ends round.
     gentle_mm_s2 : float
-        Acceleration of what is not looked at.
+        Acceleration of everything that is not examined.
     """
 
     def __init__(self, machine: Machine, settings: PrintSettings) -> None:
@@ -154,7 +154,7 @@ class Program:
             "M220 S100",
             "M221 S100",
             "M107",
-            # Planned motion is predicted, and shown, without the firmware's shaper.
+            # Planned motion is predicted and compared without the firmware's shaper.
             *self._stream_commands.shaper_off.decode().splitlines(),
         )
         self.limit_accel(self.gentle_mm_s2)
@@ -166,7 +166,7 @@ class Program:
         self._line((purge_from[0] + purge_mm, purge_from[1]), 20.0, 2.0)
 
     def finish(self) -> None:
-        """Give the machine back: limits, shaper, heaters off, nozzle up and aside."""
+        """Restore limits and shaper, switch heaters off, move the nozzle up and aside."""
         machine = self._machine
         self._retract()
         self.limit_accel(machine.firmware.largest_accel_mm_s2)
@@ -198,7 +198,7 @@ class Program:
         self._rise(z_mm)
 
     def region(self, name: str) -> None:
-        """Name what follows: figures are wanted of it."""
+        """Start a named region, for which figures are computed."""
         self._add(f";TYPE:{name}")
 
     @contextmanager
@@ -209,11 +209,11 @@ class Program:
         self._add("; STILLPATH_OFF")
 
     def limit_accel(self, accel_mm_s2: float) -> None:
-        """Set the acceleration of what follows."""
+        """Set the acceleration of the following moves."""
         self._add(*self._stream_commands.acceleration(accel_mm_s2).decode().splitlines())
 
     def stand(self, seconds: float) -> None:
-        """Stand still, filament back."""
+        """Stand still with filament retracted."""
         self._retract()
         self._add(f"G4 P{1e3 * seconds:.0f}")
 
@@ -288,7 +288,7 @@ def _check(settings: PrintSettings) -> None:
 
 
 def _meander(low: Point, high: Point, pitch: float, *, along_y: bool) -> list[Point]:
-    """Lines that fill a rectangle, to and fro."""
+    """Return lines that fill a rectangle back and forth."""
     if along_y:
         turned = _meander((low[1], low[0]), (high[1], high[0]), pitch, along_y=False)
         return [(x, y) for y, x in turned]

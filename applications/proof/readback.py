@@ -1,4 +1,4 @@
-"""Compares an accelerometer log taken during a print with the model's prediction for that print."""
+"""Compare an accelerometer log taken during a print with the model's prediction for it."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ Array = NDArray[np.float64]
 _RECORD = "record with ACCELEROMETER_MEASURE (Klipper) or M956 (RepRapFirmware) during the print"
 _RATE_HZ = 1000.0
 _LONGEST_S = 240.0
-"""More of a log tells nothing new."""
+"""Longest part of a log that is compared; more gives no new information."""
 _MOUNT_BAND_HZ = (3.0, 20.0)
 _SEEN = 0.3
-"""An axis is in the log if the sensor answers to it by this much of the other one."""
+"""Least response of the sensor to an axis, relative to the other, to count as logged."""
 _MATCHED = 0.5
 
 
@@ -151,7 +151,7 @@ def _in_machine_axes(
     inside = (found.log_time_s(t) >= own[0]) & (found.log_time_s(t) <= own[-1])
     t, part = t[inside], slice(start + int(np.argmax(inside)), None)
     part = slice(part.start, part.start + len(t))
-    # Above what is compared nothing may alias into it.
+    # Remove what could alias into the compared band.
     smooth = Signal(log.t0_s, log.dt_s, band_pass(log.rows, log.dt_s, 0.5, 0.4 * _RATE_HZ))
     m = smooth.at(found.log_time_s(t))
     p = predicted.rows[:, part]

@@ -1,4 +1,4 @@
-"""The lines by which each firmware logs its accelerometer during a ring test."""
+"""G-code with which each firmware logs its accelerometer during a ring test."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from stillpath.models.firmware import Firmware
 __all__ = ["Recorder", "RingSettings", "recorder_for"]
 
 _RATES_HZ = (1300.0, 1700.0)
-"""Of the accelerometers that RepRapFirmware knows, with some room."""
+"""Sampling rates of the accelerometers that RepRapFirmware supports, with a margin."""
 _MOST_SAMPLES = 65535
 """S of M956 holds 16 bits (RepRapFirmware src/Accelerometers/Accelerometers.cpp, 3.4 to 3.6)."""
 
 
 @dataclass(frozen=True, slots=True)
 class RingSettings:
-    """What the machine's model does not know.
+    """Settings that are not in the machine's model.
 
     Attributes
     ----------
@@ -34,7 +34,7 @@ class RingSettings:
 
 
 class Recorder:
-    """Lines around a ring test; of itself, for a firmware without a sensor, it has none.
+    """Lines around a ring test; the base class, for firmware without a sensor, has none.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ class Recorder:
         "that moves, at 1000 samples per second or more, and let it log from before the file until",
         "after it, as `#time,accel_x,accel_y,accel_z` in s and mm/s2.",
     )
-    """What a person is to do, for the first lines of the file."""
+    """Instructions to the user for the first lines of the file."""
 
     def __init__(self, settings: RingSettings) -> None:
         self._chips = (settings.chip_x, settings.chip_y or settings.chip_x)
@@ -98,7 +98,7 @@ class _Klipper(Recorder):
 
 
 class _RepRap(Recorder):
-    """A log for each round: the number of samples has an end."""
+    """One log per round, as the number of samples is limited."""
 
     instruction = (
         "The logs are ring-1*.csv and ring-2*.csv in 0:/sys/accelerometer. Give all of them to",

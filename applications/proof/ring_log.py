@@ -1,7 +1,7 @@
-"""Reads a ring test's accelerometer log: the vibration after every stop that it covers.
+"""Read a ring test's accelerometer log: the vibration after every stop that it covers.
 
-The log is placed by `matching`, and turned by least squares into the direction in which it moved
-while the file was about one axis. A stop counts if the log shows its braking.
+The log is located by `matching`, and rotated by least squares into its direction of motion while
+the file moves one axis. A stop counts if the log shows its braking.
 """
 
 from __future__ import annotations
@@ -35,17 +35,17 @@ __all__ = [
 Array = NDArray[np.float64]
 
 WINDOW_S = (0.01, 0.31)
-"""After a stop: the clock is known to a millisecond or so."""
+"""Evaluated time after a stop; the clock is known to about a millisecond."""
 _MOUNT_BAND_HZ = (3.0, 20.0)
 _BRAKING_S = 0.06
-"""What is looked at on both sides of the braking, to tell whether the log shows it."""
+"""Time on both sides of the braking that is checked for it in the log."""
 _COHERENT = 0.6
 _TAPER = 0.2
 _EDGE_S = 0.1
 _KEPT_HZ = (0.5, 0.4 * RATE_HZ)
-"""Above what is compared nothing may alias into it."""
+"""Pass band of the log: removes what could alias into the compared band."""
 _SETTLED_S = 0.5
-"""What the move before a rest made has died down."""
+"""Time after which vibration of the move before a rest has decayed."""
 _LOWEST_HZ = 5.0
 _LAG_BAND_HZ = (3.0, 30.0)
 _LAG_SAMPLES = 20
@@ -53,7 +53,7 @@ _LAG_SAMPLES = 20
 
 @dataclass(frozen=True, slots=True)
 class Band:
-    """Frequencies whose vibration counts."""
+    """Frequency band of the evaluated vibration."""
 
     low_hz: float
     high_hz: float
@@ -208,7 +208,7 @@ def misses(log: AxisLog, motion: RingMotion, predicted: Array, band: Band) -> fl
 
 
 def lag_s(log: AxisLog, motion: RingMotion, predicted: Array) -> float:
-    """Return by how much the log comes later than a prediction, below the modes."""
+    """Return the delay of the log relative to a prediction, below the modes."""
     m, p = (band_pass(x, 1.0 / RATE_HZ, *_LAG_BAND_HZ) for x in (log.measured, predicted))
     kept = motion.about[log.axis] & log.inside
     shifts = np.arange(-_LAG_SAMPLES, _LAG_SAMPLES + 1)

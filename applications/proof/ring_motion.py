@@ -1,4 +1,4 @@
-"""The motion of a ring test's file: its sudden stops, and the model's prediction for them."""
+"""The motion of a ring test: its sudden stops, and the model's prediction for them."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ RATE_HZ = 1000.0
 _HEAD_BYTES = 4096
 _HEX = "([0-9a-f]{12})"
 _FAST = 0.95
-"""Share of a move's top speed below which it brakes."""
+"""Share of a move's top speed below which it counts as braking."""
 
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """A stop: `from_s` when the braking begins, `at_s` from when on the axis is to stand still.
+    """A stop: braking begins at `from_s`, and the axis should stand still from `at_s` on.
 
     Stops of one `kind` are from the same speed in the same direction.
     """
@@ -162,12 +162,12 @@ def _stops(
 
 
 def _runs_s(inside: NDArray[np.bool_]) -> list[tuple[float, float]]:
-    """Return from when until when something holds."""
+    """Return the time ranges in which a mask is true."""
     return [(first / RATE_HZ, end / RATE_HZ) for first, end in runs(inside)]
 
 
 def _plants(printed: Path) -> dict[Axis, str]:
-    """Return what the first lines say of the plants."""
+    """Return the plant digests in the first lines of the file."""
     with printed.open("rb") as file:
         head = file.read(_HEAD_BYTES).decode("utf-8", "replace")
     return {axis: digest for axis in AXES for digest in re.findall(plants_line(axis, _HEX), head)}

@@ -1,9 +1,8 @@
 """A ring test: fast moves that stop dead, as planned and compensated, and a rest after each.
 
-Nothing is printed and nothing is heated. While an axis rests the other one creeps: motion goes on
-as after a corner of a print, so that compensation can act after the stop as it does there. All
-rests differ, so that a log of one axis cannot be mistaken for one of the other, nor one stop for
-the next.
+Nothing is printed or heated. While an axis rests the other one creeps: motion continues as after a
+corner of a print, so that compensation can act after the stop as it does there. All rests have
+different durations, so that axes and stops cannot be confused in a log.
 """
 
 from __future__ import annotations
@@ -44,15 +43,15 @@ AXES: tuple[Axis, Axis] = ("x", "y")
 REST = " rest"
 PARTS = ("quiet", "off", "off" + REST, "on", "on" + REST)
 TITLE = "Ring test for "
-"""The first line of the file begins so."""
+"""Beginning of the file's first line."""
 _SPEEDS_MM_S = (60.0, 100.0, 150.0)
 _NEAR = 0.15
-"""Share by which a speed may differ from these, where the two ends of the braking cancel."""
+"""Relative change allowed to these speeds, to avoid cancellation between both ends of braking."""
 ROUNDS = 2
 _REST_S = (0.6, 1.0)
 _QUIET_S = 2.0
 _CREEP_MM_S = 3.0
-"""Below what firmwares let pass at a corner without braking."""
+"""Below the corner speed that firmwares allow without braking."""
 _GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
 _CRUISE = 2.5
 """Length of a move in units of v^2 / a: Klipper lowers the acceleration of those below 2."""
@@ -61,7 +60,7 @@ _TRAVEL_MM_S = 100.0
 
 
 class RingTest:
-    """Write a ring test; it moves, and nothing else.
+    """Writes a ring test, which only moves.
 
     Parameters
     ----------
@@ -105,7 +104,7 @@ class RingTest:
         start = self._settings.start_gcode
         self._add(*(["G28"] if start is None else start.splitlines()))
         self._add("; STILLPATH_OFF", "G90", "M83", "M220 S100")
-        # Both halves are predicted, and felt, without the firmware's shaper.
+        # Both halves are predicted and measured without the firmware's shaper.
         self._add(*self._stream_commands.shaper_off.decode().splitlines())
         self._add(*self._stream_commands.acceleration(self.accel_mm_s2).decode().splitlines())
         travel = self._machine.travel["z"]
@@ -132,10 +131,9 @@ class RingTest:
         self._add(*(self._stream_commands.shaper_on or b"").decode().splitlines())
 
     def _stops(self, half: Literal["off", "on"]) -> float:
-        """Write a to and fro of each axis at every speed; return about how long it lasts.
+        """Move each axis back and forth at every speed; return the approximate duration.
 
-        X and Y take turns: were one after the other, a clock that runs wrong could not be told
-        from an axis that is late.
+        X and Y alternate, so that a wrong clock rate can be told from a delay of one axis.
         """
         seconds = 0.0
         for k in range(len(_SPEEDS_MM_S)):
@@ -251,7 +249,7 @@ def plants_line(axis: Axis, digest: str) -> str:
 
 
 def _rests() -> Iterator[float]:
-    """Rests of which no two are alike."""
+    """Yield rests, no two of which are equal."""
     low, high = _REST_S
     share = 0.0
     while True:

@@ -29,7 +29,7 @@ Axis = Literal["x", "y"]
 _RUN_MM, _WALL_MM = 25.0, 30.0
 _BAND_MM = 5.0
 _RIB_MM = 0.25
-"""The first layer of a band stands out so far."""
+"""Protrusion of the first layer of a band."""
 _FEWEST, _MOST = 2, 12
 
 
@@ -101,7 +101,7 @@ def write_tower(
     Parameters
     ----------
     axis : "x" or "y"
-        Whose ringing is wanted: of X it shows on the outer side walls, of Y on the front walls.
+        Axis to show: ringing of X is on the outer side walls, of Y on the front walls.
     count : int
         Number of bands, 2 to 12.
     machine, target, settings, cache_dir, progress
@@ -110,7 +110,7 @@ def write_tower(
     Raises
     ------
     ModelError
-        The axis or the number of bands is none, the travel is too small, or nothing rings.
+        The axis or number of bands is invalid, the travel is too small, or nothing rings.
     DesignError, GcodeError
         As of `pipeline.compensate.compensate_file`.
     """

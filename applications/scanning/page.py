@@ -1,4 +1,4 @@
-"""Turns a scan into scan.html and scan.json, and its command into a table."""
+"""Write a scan as scan.html and scan.json, and its command as a table."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def write_command(scan: Scan, target: Path) -> None:
 
 def render_scan(report: ScanReport) -> str:
     """Return the scan as one HTML page."""
-    # The lag of the path as sent would hide what an add-on does.
+    # The lag of the path as sent would hide the effect of an add-on.
     drawn = report.variants[-2:]
     highest = max(track.rms_um[v.name] for track in report.tracks for v in drawn)
     plates = [_Plate(v.label, _plate(report, v.name, highest)) for v in drawn]

@@ -1,4 +1,4 @@
-"""A hatch file on a scanner: its command with a prefilter, and the residual error of each track.
+"""Compute a scanner's command for a hatch file, and the residual error of each track.
 
 Variants of the prediction, all with the same disturbance: the path as sent, after the prefilter,
 and with the add-on controller too.
@@ -44,12 +44,12 @@ _SEED = 0
 
 @dataclass(frozen=True, slots=True)
 class ScanSettings:
-    """How a file is drawn.
+    """Settings of a scan.
 
     Attributes
     ----------
     um_per_unit : float, optional
-        How far the beam moves on the work per unit of the machine; needed unless that is mm or um.
+        Beam travel on the work per unit of the machine; needed unless that is mm or um.
     prefilter : "zpetc", "fbf" or "none"
     cutoff_hz : float, optional
         Of a zero-phase low-pass after zpetc.
@@ -58,7 +58,7 @@ class ScanSettings:
         In the machine's unit. Left out, the controller's own, scaled to `disturbance_um`.
     enters : "output" or "input", optional
     disturbance_um : float
-        rms that it leaves at the output without an add-on.
+        Its rms at the output without an add-on.
     """
 
     um_per_unit: float | None = None
@@ -96,7 +96,7 @@ def scan_file(
     settings: ScanSettings,
     controller: LoadedController | None = None,
 ) -> Scan:
-    """Make the command of a hatch file and predict every track; both axes are alike.
+    """Compute the command of a hatch file and predict every track; both axes are equal.
 
     Raises
     ------
@@ -168,7 +168,7 @@ class _Disturbed:
 
 
 class _Prefilter:
-    """From the wanted path to the reference, with what the report says about it."""
+    """Turns the wanted path into the reference, with figures for the report."""
 
     def __init__(self, loop: Loop, settings: ScanSettings) -> None:
         self._loop = loop
@@ -229,7 +229,7 @@ class _Drive:
         return cls(loop, spec, blocks, controller.every, disturbed, warm_up)
 
     def run(self, reference: Array, wanted: Array) -> Array:
-        """Return the output, shape (2, n), of a machine that stands where the path begins."""
+        """Return the output, shape (2, n), of a machine at rest at the start of the path."""
         return np.array(
             [self._axis(r - r[0]) + y_d[0] for r, y_d in zip(reference, wanted, strict=True)]
         )
@@ -246,10 +246,9 @@ class _Drive:
 
 
 def _expecting(blocks: Sequence[Block], loop: Loop, every: int) -> tuple[Block, ...]:
-    """Make an add-on compare the output with what the reference leads to, not with itself.
+    """Let an add-on compare the output with the expected one instead of the reference.
 
-    A plug-in on the control error would take a prefilter's reference, which runs ahead, for an
-    error.
+    A plug-in on the control error would mistake the lead of a prefilter's reference for an error.
     """
     compared = [b for b in blocks if ("ym", 1.0) in b.inputs and ("r", -1.0) in b.inputs]
     if not compared:
@@ -265,7 +264,7 @@ def _expecting(blocks: Sequence[Block], loop: Loop, every: int) -> tuple[Block, 
 
 
 def _machine(spec: LoopSpec) -> tuple[object, object]:
-    """Return what a controller is made for, apart from names."""
+    """Return the properties of a machine that a controller depends on."""
     return spec.loop, spec.sensor
 
 

@@ -1,1 +1,1 @@
-"""Feedback designs for closed-loop machines: what a controller adds to a baseline loop."""
+"""Feedback designs for closed-loop machines: add-ons to a baseline loop."""

@@ -1,4 +1,4 @@
-"""The sample loop of the frequency identification; `adaptive` gives it names and checks."""
+"""Kernel of the frequency identification, wrapped by `adaptive`."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def track(
     `theta` has a_1 .. a_m of A = 1 + a_1 z^-1 + .. + a_m z^-m + .. + a_1 z^-(2m-1) + z^-2m;
     `poles` the same numbers as used in A(rho z). `history` has the last 2m filtered samples,
     newest first. `radius` and `forgetting` hold (now, end, decay towards the end); `levels` the
-    mean squares of error, filtered signal and signal. All but x and poles are carried on.
+    mean squares of error, filtered signal and signal. All but x and poles are updated in place.
     """
     m = len(theta)
     psi = np.empty(m)

@@ -1,9 +1,9 @@
-"""Tones of unknown, jumping frequency: identification, and the observer that follows it.
+"""Identify tones of unknown, jumping frequency, and retune the observer to follow them.
 
 A notch A(z)/A(rho z) with mirror-symmetric A is fitted to the disturbance estimate by recursive
-least squares. What makes it lock on the right frequency (finding 1g of the reference): after
-every jump covariance and data start anew, and the notch starts wide (rho .3) and short in memory
-(lambda .9) before it narrows (.98, .995). Started at rho = .9 it locked 1 kHz off.
+least squares. To lock on the right frequency (finding 1g of the reference), covariance and data are
+reset after every jump, and the notch starts wide (rho .3) with a short memory (lambda .9) before it
+narrows (.98, .995). Started at rho = .9 it locked 1 kHz off.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ _START_FORGETTING, _END_FORGETTING = 0.9, 0.995
 _DECAY_SAMPLES = 25
 _START_COVARIANCE = 1e4
 _LARGEST_POLE = 0.97
-# Shares of power that the zeros leave over when a tone has moved. After the poles, which lift the
-# tone, it is some 1/600 of noise over tone when locked; of the signal itself it is the noise.
+# Shares of power that the zeros leave once a tone has moved. When locked: after the poles, which
+# amplify the tone, about 1/600 of the noise-to-tone ratio; of the signal itself, the noise.
 _LEFT_BEHIND_POLES, _LEFT_OF_SIGNAL = 2e-3, 0.4
 
 
@@ -43,16 +43,16 @@ class FrequencyTracker:
     Parameters
     ----------
     tones : int
-        At most 8. One locks within some 100 samples, three within some 500, also at a signal-to-
-        noise ratio of 8 dB.
+        At most 8. One locks within about 100 samples, three within about 500, even at a
+        signal-to-noise ratio of 8 dB.
     dt_s : float
     floor_rms : float
-        Below this rms there is nothing to identify.
+        Signals below this rms are ignored.
 
     Attributes
     ----------
     jumped : bool
-        Whether the last block made it start anew.
+        Whether the last block caused a restart.
     """
 
     def __init__(self, tones: int, dt_s: float, floor_rms: float = 1e-6) -> None:
@@ -79,7 +79,7 @@ class FrequencyTracker:
         cosines = _cosines(now.theta)
         now.poles[:] = _coefficients(cosines)
         if now.heard <= 2 * _DECAY_SAMPLES:
-            # The first errors say nothing, and may be huge.
+            # The first errors are meaningless and may be huge.
             now.levels[:] = 0.0
         elif now.heard > 4 * _DECAY_SAMPLES * self._tones and now.lost:
             return self._restart()
@@ -105,8 +105,8 @@ class Retuning:
 class AdaptiveFmsdob:
     """A forward-model observer whose targets follow the disturbance.
 
-    Run a loop with `blocks` for a short block (1 ms), hand the recorded signal "dhat" to `hear`,
-    and put what it returns into the loop.
+    Run a loop with `blocks` for a short time (1 ms), pass the recorded signal "dhat" to `hear`, and
+    apply the coefficients that it returns to the loop.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ class AdaptiveFmsdob:
     bandwidth_hz : float
         Of the band pass.
     floor_rms : float
-        Of the disturbance; silence below.
+        Below this rms of the disturbance the observer is silent.
     """
 
     def __init__(
@@ -141,7 +141,7 @@ class AdaptiveFmsdob:
 
     @property
     def targets_hz(self) -> tuple[float, ...]:
-        """What it works against now; () while it is silent."""
+        """Frequencies currently rejected; () while the observer is silent."""
         return self._tuned
 
     @property
@@ -150,7 +150,7 @@ class AdaptiveFmsdob:
         return add_on_blocks(self._loops[0], self._silent(), "servo")
 
     def hear(self, dhat: Array) -> Retuning | None:
-        """Return what to change after the samples `dhat`, shape (n,); None: nothing."""
+        """Return new coefficients after the samples `dhat`, shape (n,); None: no change."""
         disturbance, self._memory = lfilter(*self._unloop, dhat, zi=self._memory)
         found = self.tracker.push(disturbance)
         moved, self._last = _apart(found, self._last), found
@@ -162,7 +162,7 @@ class AdaptiveFmsdob:
         return self._retuned(found)
 
     def controller(self) -> Controller:
-        """Return the judged controller of the present targets.
+        """Return the checked controller for the present targets.
 
         Raises
         ------
@@ -185,7 +185,7 @@ class AdaptiveFmsdob:
                 self._judged = targets
             q = design_q(self._loops[0], targets, bandwidth_hz=self._bandwidth_hz)
         except DesignError:
-            # Two tones not told apart yet, or a member would be unstable: leave it until they move.
+            # Tones not separated yet, or an unstable member: keep the old targets until they move.
             self._tuned, self._refused = before, targets
             return None
         far = _apart(targets, before) > 0.5 * self._bandwidth_hz
@@ -198,7 +198,7 @@ class AdaptiveFmsdob:
 
 @dataclass(slots=True, eq=False)
 class _Estimate:
-    """What the recursion remembers; arrays as in `track`."""
+    """State of the recursion; arrays as in `track`."""
 
     theta: Array
     poles: Array
@@ -224,7 +224,7 @@ class _Estimate:
 
     @property
     def lost(self) -> bool:
-        """Whether more is left over than noise would leave."""
+        """Return whether the residual is larger than noise would leave."""
         error, filtered, signal = self.levels
         return bool(error > _LEFT_BEHIND_POLES * filtered or error > _LEFT_OF_SIGNAL * signal)
 
@@ -239,7 +239,7 @@ def _cosines(theta: Array) -> Array:
 def _unlooped(loop: Loop) -> tuple[Array, Array]:
     """Return a stable filter close to 1/S0.
 
-    Around the servo, dhat is S0 d: tones that the baseline loop suppresses would drown.
+    Around the servo, dhat is S0 d: tones that the baseline loop suppresses would be lost in noise.
     """
     poles = np.roots(np.convolve(loop.plant_den, loop.controller[1]))
     size = np.maximum(np.abs(poles), 1e-300)

@@ -58,12 +58,12 @@ class LatticeBandPass:
 
     @property
     def k1(self) -> tuple[float, ...]:
-        """-cos of the centres: set the frequencies, nothing else."""
+        """-cos of the centres: these set only the frequencies."""
         return tuple(-math.cos(w) for w in self.centres)
 
     @property
     def k2(self) -> tuple[float, ...]:
-        """Set the widths, nothing else."""
+        """Coefficients that set only the widths."""
         return tuple((1 - math.tan(b / 2)) / (1 + math.tan(b / 2)) for b in self.widths)
 
     def notches(self) -> tuple[tuple[tuple[float, ...], tuple[float, ...]], ...]:
@@ -85,7 +85,7 @@ class LatticeBandPass:
         return np.asarray(1.0 - out, complex)
 
     def slope(self, index: int) -> complex:
-        """Return dQ_BP/dw at the centre `index`: all phase, the magnitude is flat there."""
+        """Return dQ_BP/dw at the centre `index`: purely phase, as the magnitude is flat there."""
         others = 1.0 + 0.0j
         z = np.exp(1j * np.array([self.centres[index]]))
         for i, (num, den) in enumerate(self.notches()):

@@ -1,8 +1,8 @@
 """The result of every feedback design: coefficients, their blocks, and the expected performance.
 
-A design hands its blocks (`models.diagrams`) and its add-on factor 1 - PQ to `judged`, which
-predicts the loop with it, checks every member of the plant set, and refuses what must not be
-loaded. The blocks read ym, u, v, r of `models.loops` and write c.
+A design passes its blocks (`models.diagrams`) and its add-on factor 1 - PQ to `judged`, which
+predicts the loop with the add-on, checks every member of the plant set, and refuses unsafe
+controllers. The blocks read ym, u, v, r of `models.loops` and write c.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ Values = float | int | tuple[float, ...] | tuple[tuple[float, ...], ...]
 Uncertainty = float | Callable[[Array], Array]
 """Bound of the relative plant error |Delta(f)|: one number, or a function of the frequencies."""
 _BEST_KNOWN = 1e-4
-"""No plant is known better. Below, rounding alone would decide whether a loop is stable."""
+"""Least accepted bound: below it, rounding alone would decide whether a loop is stable."""
 
 
 class Refusal(DesignError):
@@ -48,7 +48,7 @@ class Refusal(DesignError):
     ----------
     reason : str
     f_hz : float or None
-        Where it is violated.
+        Frequency of the violation.
     """
 
     def __init__(
@@ -129,30 +129,30 @@ class Prediction:
 
     @property
     def max_add_on(self) -> Extreme:
-        """Largest |1 - PQ|: what the notches are paid with."""
+        """Largest |1 - PQ|: the amplification elsewhere that the notches cost."""
         i = int(np.argmax(np.abs(self.add_on)))
         return Extreme(float(np.abs(self.add_on[i])), float(self.f_hz[i]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Controller:
-    """A designed add-on, judged fit to be loaded.
+    """A designed add-on that passed all checks.
 
     Attributes
     ----------
     method, machine : str
     dt_s : float
-        Ticks of the blocks.
+        Sampling time of the blocks.
     coefficients : tuple of CoefficientSet
     blocks : tuple of Block
-        The same as difference equations; they run in `simulation.closed_loop`.
+        The controller as difference equations, which `simulation.closed_loop` can run.
     prediction : Prediction
     noise_gain : float
         rms of y per rms of white sensor noise, unless `notes` says otherwise.
     spectral_radii : tuple of float
         Of the whole loop, for the nominal plant and every member; all below 1.
     settings : mapping
-        What was asked for (targets, widths, ...), for the record.
+        The requested design (targets, widths, ...), for the record.
     notes : tuple of str
     """
 
@@ -207,8 +207,8 @@ class Controller:
     def to_c_header(self) -> str:
         """Return the coefficients as a C header (C99, no dependency).
 
-        The signals and the order of the computation stand in its comment; the numbers of every
-        filter named there stand in `to_json` under difference_equations.
+        Its comment lists the signals and the order of computation; the coefficients of every filter
+        named there are in `to_json` under difference_equations.
         """
         guard = f"STILLPATH_{_identifier(self.method)}_{_identifier(self.machine)}_H".upper()
         prefix = _identifier(self.method).lower()
@@ -230,16 +230,16 @@ class Controller:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Design:
-    """An add-on before it is judged.
+    """An add-on before it is checked.
 
     Attributes
     ----------
     noise_gain : float, optional
-        Left out: the rms of T over frequency.
+        Default: the rms of T over frequency.
     every : int
-        Ticks of the blocks per sample of the loop.
+        Block samples per sample of the loop.
     sensor : SensorSpec, optional
-        What the add-on measures with, beside the servo.
+        Additional sensor of the add-on.
     """
 
     method: str
@@ -256,16 +256,16 @@ class Design:
 def judged(
     design: Design, loops: Sequence[Loop], uncertainty: Uncertainty | None = None
 ) -> Controller:
-    """Return the controller if it may be loaded.
+    """Return the controller if it passes all checks.
 
     Parameters
     ----------
     design : Design
     loops : sequence of Loop
-        The nominal loop first, then the members it may turn into.
+        The nominal loop, then the members of its plant set.
     uncertainty : float or function of f_hz, optional
-        Relative plant error that must be survived at every frequency (small gain; sufficient,
-        not necessary), at least 1e-4. The members are always checked, exactly.
+        Relative plant error to tolerate at every frequency (small gain; sufficient, not necessary),
+        at least 1e-4. The members are always checked exactly.
 
     Raises
     ------

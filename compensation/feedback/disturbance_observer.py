@@ -2,9 +2,9 @@
 
     u = v - c,   c = Q / Gn* ym - z^-m Q u,   P ~ z^-m Gn*,   L = z^-m Q
 
-The delay stands in the model, not in an inverse: S = S0 (1 - L). A double integrator held over a
-sample has a zero at -1, and so has the bilinear transform of Q; the inverse of Gn* would ring
-there forever. It is taken out of both before anything is realised (the paper's figure 15).
+The delay is in the model, not in an inverse: S = S0 (1 - L). A double integrator held over a sample
+has a zero at -1, and so has the bilinear transform of Q; the inverse of Gn* would ring there
+forever. It is cancelled in both before anything is realised (the paper's figure 15).
 
 With P = z^-m Gn* E, S = S0 (1 - L) / (1 + S0 L (E - 1)).
 """
@@ -57,19 +57,19 @@ def design_disturbance_observer(
     Parameters
     ----------
     loops : sequence of Loop
-        The loop it is for and what that may turn into.
+        The nominal loop, then the members of its plant set.
     cutoff_hz : float
         1 / (2 pi tau) of Q.
     nominal : Loop, optional
-        Whose plant the observer assumes: an inertia with delay, say. Default: the first of `loops`.
+        Loop whose plant the observer assumes (say, inertia and delay). Default: the first loop.
     uncertainty
         See `compensation.feedback.controller.judged`.
 
     Raises
     ------
     Refusal
-        If the plant has a zero that neither Q nor a stable inverse takes care of, or a loop would
-        not be stable.
+        If the plant has a zero that neither Q nor a stable inverse can cancel, or a loop would be
+        unstable.
     """
     true, assumed = loops[0], loops[0] if nominal is None else nominal
     dt_s = true.dt_s
@@ -136,7 +136,7 @@ def observer_sensitivity(cutoff_hz: float, dt_s: float, delay: int, f_hz: ArrayL
 def delay_limit_hz(delay_s: float) -> float:
     """Return the cutoff at which |Q Delta| reaches 1, Delta = exp(-s delay) - 1.
 
-    What an observer can do that does not know of the delay (the paper's figure 7).
+    This limits an observer that does not model the delay (the paper's figure 7).
     """
     f = np.geomspace(1e-3 / delay_s, 20 / delay_s, 20_001)
     error = np.abs(np.exp(-2j * np.pi * f * delay_s) - 1)
@@ -148,14 +148,14 @@ def delay_limit_hz(delay_s: float) -> float:
 
 
 def _split_delay(num: Sequence[float]) -> tuple[int, Array]:
-    """Whole samples of delay, and the numerator without them."""
+    """Return the whole samples of delay, and the numerator without them."""
     values = np.trim_zeros(np.asarray(num, float), "b")
     delay = int(np.flatnonzero(values)[0])
     return delay, values[delay:]
 
 
 def _without_common_zeros(q_num: Array, plant_num: Array) -> tuple[Array, Array]:
-    """Take zeros at -1 out of both as long as both have one."""
+    """Cancel zeros at -1 as long as both have one."""
     up = np.array([1.0, 1.0])
     while abs(np.polyval(plant_num, -1.0)) < 1e-9 * np.abs(plant_num).sum() and len(q_num) > 1:
         left = np.polydiv(q_num, up)

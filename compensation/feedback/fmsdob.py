@@ -1,9 +1,9 @@
 """Forward-model selective disturbance observer: rejects tones and bands without a plant inverse.
 
 Paper 000 (Jiang, Xiao, Tang, Sun, Chen, IEEE TCST 2020):  dhat = y - F (what F was driven with),
-c = Q dhat, S = S0 (1 - F Q), with Q = 1/F at the targets only. The forward model F is, here,
+c = Q dhat, S = S0 (1 - F Q), with Q = 1/F at the targets only. The forward model F is one of
 
-- "servo" (default): F = P/(1 + PC), driven with what the loop is told; T0 itself if C = 1. F and Q
+- "servo" (default): F = P/(1 + PC), driven with the loop's input; T0 itself if C = 1. F and Q
   are stable, so the loop is internally stable for every plant whose baseline is, integrators
   included: this is (18) of Youla, with X/Y = C and N = F (Remark 8 of the paper).
 - "plant": F = P, driven with u, as the paper draws it. P must be strictly stable.
@@ -64,7 +64,7 @@ class QFilter:
     taps : tuple of float
     band_pass : LatticeBandPass or None
     gain : float
-        Detuning: below 1 the notches end at 1 - gain.
+        Detuning: below 1 the depth of the notches is 1 - gain.
     """
 
     taps: tuple[float, ...]
@@ -105,18 +105,18 @@ class QFilter:
 
 @dataclass(frozen=True, slots=True)
 class Trim:
-    """What else a Q may be made to do.
+    """Further requirements on Q.
 
     Attributes
     ----------
     detuning : float
-        In (0, 1]; below 1 it takes from the notches and gives to the rest.
+        In (0, 1]; below 1 the notches are shallower, and less is amplified elsewhere.
     zeros : sequence of (radius, f_hz)
-        Fixed zeros of Q: keep it out of frequencies that must not change.
+        Fixed zeros of Q, at frequencies that must not change.
     through_band : bool
-        Interpolate 1/(F Q_BP) with its slope instead of 1/F. The band pass turns the phase at
-        the targets, so a Hermite Q after it is no wider than a pointwise one; this undoes the
-        turn, and with it what the band pass had saved elsewhere.
+        Interpolate 1/(F Q_BP) with its slope instead of 1/F. The phase slope of the band pass makes
+        the notches of a Hermite Q as narrow as pointwise ones; this compensates it, and also loses
+        what the band pass had saved elsewhere.
     """
 
     detuning: float = 1.0
@@ -124,7 +124,7 @@ class Trim:
     through_band: bool = False
 
     def settings(self) -> dict[str, object]:
-        """Return the settings as a controller's document states them."""
+        """Return the settings as stored in a controller's document."""
         zeros = [list(zero) for zero in self.zeros]
         return {"detuning": self.detuning, "zeros": zeros, "through_band": self.through_band}
 
@@ -152,12 +152,12 @@ def fmsdob(
         Whether 1 - FQ has a zero, or a double zero (wider notch) at the targets. Low targets
         against the sampling rate make Hermite filters amplify elsewhere: see `max_add_on`.
     bandwidth_hz : float, sequence of float, or None
-        -3 dB width of the band pass; None leaves it out.
+        -3 dB width of the band pass; None: no band pass.
     trim : Trim
     around : "servo" or "plant"
         Forward model, see the module.
     uncertainty : float or function of f_hz, optional
-        Relative plant error to survive everywhere.
+        Relative plant error to tolerate everywhere.
 
     Raises
     ------
@@ -239,7 +239,7 @@ def target_angles(loop: Loop, targets_hz: Sequence[float]) -> Array:
     Raises
     ------
     DesignError
-        If there is none, one is not between 0 and half the sampling rate, or one is named twice.
+        If there is none, one is not between 0 and half the sampling rate, or one is repeated.
     """
     top = 0.5 / loop.dt_s
     targets = np.asarray(targets_hz, float)

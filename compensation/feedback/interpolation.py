@@ -1,7 +1,7 @@
-"""FIR filters through given values: the inverse of a plant at the frequencies that matter.
+"""FIR filters that interpolate the inverse of a plant at given frequencies.
 
 Papers 000 (Propositions 4 and 6) and 001 (Theorem 1), with the signs of the right-hand sides and
-the rows of (10) put right.
+the rows of (10) corrected.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def inverse_and_slope(
     Raises
     ------
     DesignError
-        If P is 0 at one of them: what the plant blocks, no add-on can reach.
+        If P is 0 at one of them: no add-on can act at a frequency that the plant blocks.
     """
     top, top_slope = _value_and_slope(num, w)
     bottom, bottom_slope = _value_and_slope(den, w)
@@ -73,7 +73,7 @@ def interpolating_fir(
     rows, wanted = [at.real, at.imag], [values.real, values.imag]
     if slopes is not None:
         steep = -1j * powers * at
-        # In units of the longest power, so that both kinds of rows are of one size.
+        # Scaled by the highest power, so that both kinds of rows have the same magnitude.
         rows += [steep.real / count, steep.imag / count]
         wanted += [slopes.real / count, slopes.imag / count]
     for (radius, angle), is_real in zip(zeros, real, strict=True):

@@ -1,8 +1,8 @@
 """Disturbance observer with a plant inverse, for comparison with the forward-model one.
 
 dhat = z^-m P^-1 y - z^-m u, c = Q dhat, S = S0 (1 - z^-m Q); Q is a band pass times the FIR that
-makes up for the m samples of delay at the targets (paper 000, section VIII-A, which takes it from
-its reference [21]). Needs zeros of P well inside the unit circle.
+compensates the m samples of delay at the targets (paper 000, section VIII-A, after its reference
+[21]). It needs zeros of P well inside the unit circle.
 """
 
 from __future__ import annotations

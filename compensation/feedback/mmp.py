@@ -1,8 +1,8 @@
-"""Tones faster than the sensor can see: model-based multirate predictor (MMP) and observer.
+"""Model-based multirate predictor (MMP) and observer for tones beyond the sensor's Nyquist rate.
 
 Paper 001 (Xiao, Jiang, Chen, Mechatronics 2019). A sensor gives every L-th sample; between them
 d[nL + k] = sum_j w_kj dL[n - j] - sum_j b_j d[(n - j)L + k], exact for the tones it is made for.
-The printed system (22)-(24) has 2mL unknowns; only its 2m equations at the tones matter:
+The published system (22)-(24) has 2mL unknowns; only its 2m equations at the tones matter:
 W_k(e^-jth_i) = e^(jw_i k) B(e^-jth_i), w_i = 2 pi f_i Ts, th_i = L w_i.
 """
 
@@ -41,7 +41,7 @@ _ALPHAS = (0.5, 0.7, 0.8, 0.85, 0.9, 0.93, 0.95, 0.97, 0.98, 0.99)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Predictor:
-    """From slow samples to fast ones.
+    """Predicts fast samples from slow ones.
 
     Attributes
     ----------
@@ -52,14 +52,13 @@ class Predictor:
     dt_s : float
         Between fast samples.
     alpha : float
-        Radius of its poles, per slow sample: 0 forgets at once, near 1 averages noise away.
+        Pole radius per slow sample: 0 has no memory, near 1 averages noise.
     b : tuple of float
         1, b_1 .. b_2m.
     w : ndarray, shape (L, 2m)
         Row k gives the sample k after the newest slow one.
     late : int
-        Age of the newest slow sample, in slow samples. When 0, row 0 is not used: that sample
-        is known.
+        Age of the newest slow sample, in slow samples. If 0, row 0 is unused: the sample is known.
     """
 
     f_hz: tuple[float, ...]
@@ -72,7 +71,7 @@ class Predictor:
 
     @property
     def runs(self) -> tuple[tuple[tuple[float, ...], tuple[float, ...]], ...]:
-        """Numerator and denominator, per slow sample, of each of the L interleaved filters."""
+        """Numerator and denominator, per slow sample, of the L interleaved filters."""
         rows = tuple((tuple(row.tolist()), self.b) for row in self.w)
         return rows if self.late else (((1.0,), (1.0,)), *rows[1:])
 
@@ -86,7 +85,7 @@ class Predictor:
 
     @property
     def settling_s(self) -> float:
-        """Time in which its start decays to 1 %."""
+        """Time in which the initial transient decays to 1 %."""
         runs = len(self.b) if self.alpha == 0 else math.log(0.01) / math.log(self.alpha)
         return runs * self.ratio * self.dt_s
 
@@ -134,7 +133,7 @@ def predictor(
     DesignError
         If a parameter is out of range.
     Refusal
-        If two tones, or a tone and its mirror image, look the same to the sensor.
+        If two tones, or a tone and its mirror image, alias to the same frequency.
     """
     if ratio < 2 or not 0 <= alpha < 1 or late < 0:
         raise DesignError(
@@ -177,7 +176,7 @@ def predictor_of_gain(
     Raises
     ------
     Refusal
-        If even a slow one has more: the tones are too near the singular set.
+        If even a slow one exceeds it: the tones are too near the singular set.
     """
     for alpha in _ALPHAS:
         made = predictor(f_hz, ratio, dt_s, alpha, late)
@@ -229,7 +228,7 @@ def mmp(
     sensor : SensorSpec
         Its rate (`every` is L) and age.
     alpha : float or None
-        Of the predictor; None takes the fastest that keeps `noise_gain`, the largest accepted.
+        Of the predictor; None: the fastest with at most `noise_gain`.
 
     Raises
     ------
@@ -301,7 +300,7 @@ def _quiet_predictor(
 
 
 def _compared(loop: Loop, sensor: SensorSpec) -> tuple[Block, ...]:
-    """Return blocks that give the disturbance at the sensor's samples, from model and sensor."""
+    """Return blocks that compute the disturbance at the sensor's samples."""
     late, every = sensor.delay_samples, sensor.every
     return (
         *model_blocks(loop),

@@ -5,8 +5,8 @@ repetitive part runs there, and every F-th value of it drives the plant. The loo
 
     C_eq(f) = (1/F) sum_k C_all(f - k fs),    1 + P C_eq = mean of G_k,   G_k(f) = G_0(f - k fs),
 
-with G_0 = 1 + P C_all at the fast rate: where G_0 is small above fs/2, G is small below, and the
-loop amplifies there although no design at the slow rate shows it. So the low-pass has to be judged
+with G_0 = 1 + P C_all at the fast rate. Where G_0 is small above fs/2, G is small below, and the
+loop amplifies there, which no design at the slow rate shows. The low-pass must therefore be checked
 up to half the fast rate (`alias_spectra`).
 """
 
@@ -71,7 +71,7 @@ def design_multirate(
     Parameters
     ----------
     loops : sequence of Loop
-        At the sampling rate: the nominal loop and what it may turn into.
+        At the sampling rate: the nominal loop, then the members of its plant set.
     fast : Loop
         The same machine, identified at the fast rate; its servo is inverted.
     fundamental_hz : float
@@ -81,8 +81,8 @@ def design_multirate(
     Raises
     ------
     Refusal
-        If the fast rate is impractically high, `fast` has another one, or the loop would not be
-        stable.
+        If the fast rate is impractically high, `fast` has another rate, or the loop would be
+        unstable.
     """
     nominal = loops[0]
     rates = fast_rate(1.0 / nominal.dt_s, fundamental_hz)
@@ -167,9 +167,9 @@ def multirate_factor(
     Parameters
     ----------
     loop : Loop
-        The true one, at the sampling rate.
+        The true loop at the sampling rate.
     inverse : ServoInverse or Loop
-        The inverse in use, or the fast loop whose exact inverse is taken as published.
+        The inverse in use, or the fast loop whose exact inverse is used, as published.
     factor : int
         F.
     f_hz : ndarray, shape (n,)

@@ -1,10 +1,10 @@
-"""PD by pole placement, with the velocity taken from the output (paper 002, section III-C).
+"""PD design by pole placement, with velocity from the output (paper 002, section III-C).
 
     v = kp (r - y) - kv (1 - p) (1 - z^-1) / (1 - p z^-1) y,    p = exp(-2 pi corner dt)
 
-The poles are those of a pure inertia 2 b0 z^-1 / (1 - z^-1)^2 without the filter's pole: of the
-variants tried, the one that gives the paper's 40 degrees and 9.3 dB. With the velocity of the
-error instead of the output, the ZPETC filter would peak at 27.5 dB and not above 50.
+The poles are placed for a pure inertia 2 b0 z^-1 / (1 - z^-1)^2 without the filter's pole: the
+variant that gives the paper's 40 degrees and 9.3 dB. With the velocity of the error instead of the
+output, the ZPETC filter would peak at 27.5 dB and not above 50.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _POINTS = 200_001
 
 @dataclass(frozen=True, slots=True)
 class Margins:
-    """How far an open loop is from instability; infinite where there is no crossover."""
+    """Stability margins of an open loop; infinite where there is no crossover."""
 
     phase_deg: float
     phase_at_hz: float
@@ -63,7 +63,7 @@ def inertia_pd(b0: float, dt_s: float, f_hz: float, zeta: float) -> tuple[float,
 
 
 def loop_margins(loop: Loop) -> Margins:
-    """Return the margins of P C, cut open at the plant's input."""
+    """Return the margins of P C, opened at the plant's input."""
     f_hz = np.linspace(0.5 / loop.dt_s / _POINTS, 0.5 / loop.dt_s, _POINTS)
     return margins(f_hz, loop.t0(f_hz) / loop.s0(f_hz))
 
@@ -81,7 +81,7 @@ def margins(f_hz: ArrayLike, open_loop: Complex) -> Margins:
     f = np.asarray(f_hz, float)
     size = 20 * np.log10(np.abs(open_loop))
     phase = np.degrees(np.unwrap(np.angle(open_loop)))
-    # The branch whose multiples of 360 degrees around -180 are the crossings.
+    # Shift the phase so that crossings of -180 degrees lie at multiples of 360.
     turn = np.mod(phase + 180.0, 360.0)
     phase_margin, phase_at = math.inf, math.nan
     for i in np.flatnonzero(np.diff(np.sign(size)) != 0):

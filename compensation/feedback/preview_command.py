@@ -1,7 +1,7 @@
-"""Reference of a closed loop by filtered basis functions with limited preview.
+"""Design the reference of a closed loop by filtered basis functions with limited preview.
 
-The windows of `compensation.preview`, with the loop from its reference to its output as the plant:
-no zero of it is cancelled or approximated, so it serves where ZPETC's gain error shows.
+It uses the windows of `compensation.preview` with the loop from reference to output as the plant.
+No zero is cancelled or approximated, so it helps where ZPETC's gain error shows.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ __all__ = ["preview_command"]
 Array = NDArray[np.float64]
 
 _WINDOW, _UPDATE = 64, 16
-"""Samples that are looked at, and of them those that are committed."""
+"""Samples in a window, and those committed per window."""
 _FUNCTIONS = 40
-"""Of the window; functions/(2 window dt) is the cut-off frequency of the command."""
+"""Per window; functions/(2 window dt) is the cut-off frequency of the command."""
 
 
 def preview_command(loop: Loop, y_d: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Plug-in repetitive control at the rate of the loop, whole or fractional periods (paper 004).
+"""Plug-in repetitive control at the loop's rate, for whole and fractional periods (paper 004).
 
     C_all = (C + P^-1 L) / (1 - L),   L = (1 - a^N) z^-N / (1 - a^N z^-N) * prod q_j(1/z) q_j(z)
 
@@ -15,11 +15,11 @@ takes the least common multiple for the rate.
 
 The inverse: zeros of V up to radius 0.97 are cancelled; those near the circle are cancelled as if
 they lay at 0.97 (an exact inverse rings there: paper 004's own fast plant has two at |z| = 1), and
-those outside are expanded into the future, which the period's delay has room for.
+those outside are expanded into the future, which the period's delay allows.
 
-A baseline with integral action lets no constant of the add-on through, V(1) = 0. A memory of
-constants would drift there forever without a trace in y, so the mean over a period is taken out
-of it: zero at constants, untouched at the harmonics.
+A baseline with integral action blocks constants from the add-on, V(1) = 0. A memory of constants
+would drift unnoticed in y, so the mean over a period is subtracted: the gain is zero at constants
+and unchanged at the harmonics.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ class InternalModel:
     notches : tuple of float
         Further zero-phase pairs, rad per sample: ((cos w - cos W) / (1 - cos W))^2.
     mean_free : bool
-        Take the mean over a period out: nothing is done against constants.
+        Subtract the mean over a period: constants are not rejected.
     """
 
     period: int
@@ -99,7 +99,7 @@ class InternalModel:
 
     @property
     def taps(self) -> Array:
-        """The zero-phase filter, symmetric: a low-pass of sum 1, less the mean if that is out."""
+        """Symmetric zero-phase filter: a low-pass of sum 1, less the mean if `mean_free`."""
         taps = np.ones(1)
         for _ in range(self.nyquist_pairs):
             taps = np.convolve(taps, [0.25, 0.5, 0.25])
@@ -159,10 +159,10 @@ class ServoInverse:
     num, den : tuple of float
         Powers of z^-1.
     preview : int
-        Samples that have to be given away elsewhere.
+        Samples of look-ahead, to be compensated by a delay elsewhere.
     notes : tuple of str
     blocks_constants : bool
-        V(1) = 0: what is put in front must be free of constants.
+        V(1) = 0: its input must be free of constants.
     """
 
     num: tuple[float, ...]
@@ -186,24 +186,24 @@ def design_wide_band(
     notches_hz: Sequence[float] = (),
     uncertainty: Uncertainty | None = None,
 ) -> Controller:
-    """Round the period to whole samples and widen the notches.
+    """Design with the period rounded to whole samples and the notches widened.
 
     Parameters
     ----------
     loops : sequence of Loop
-        The nominal loop and what it may turn into.
+        The nominal loop, then the members of its plant set.
     fundamental_hz : float
     alpha : float
     nyquist_pairs : int
     notches_hz : sequence of float
-        Frequencies where the add-on shall do nothing.
+        Frequencies at which the add-on has no effect.
     uncertainty
         See `compensation.feedback.controller.judged`.
 
     Raises
     ------
     Refusal
-        If the period is too short for the inverse, or the loop would not be stable.
+        If the period is too short for the inverse, or the loop would be unstable.
     """
     period = round(1.0 / (loops[0].dt_s * fundamental_hz)) if fundamental_hz > 0 else 0
     model = internal_model(loops[0].dt_s, period, alpha, nyquist_pairs, notches_hz)
@@ -221,10 +221,10 @@ def design_quasi(
     notches_hz: Sequence[float] = (),
     uncertainty: Uncertainty | None = None,
 ) -> Controller:
-    """Repeat the greatest common divisor of fundamental and sampling rate.
+    """Design for the greatest common divisor of fundamental and sampling rate.
 
-    Parameters and errors as `design_wide_band`; a divisor far below the fundamental makes a long
-    memory of which most notches lie where nothing is to be rejected (a note says how many).
+    Parameters and errors as `design_wide_band`. A divisor far below the fundamental makes a long
+    memory, most of whose notches are where nothing is to be rejected (a note says how many).
     """
     rate_hz = 1.0 / loops[0].dt_s
     share = shared_period(rate_hz, fundamental_hz)
@@ -247,8 +247,8 @@ def design_quasi(
 def shared_period(rate_hz: float, fundamental_hz: float) -> Fraction:
     """Return fundamental over rate as M/N: N samples hold M periods.
 
-    Both are taken to 1 mHz as they are named. Where that makes N longer than any memory, a
-    shorter N is taken if it, too, names the fundamental to 1 mHz: 1230.769 Hz at 16 kHz is 1/13.
+    Both are rounded to 1 mHz. If N is then longer than any memory, a shorter N is used that still
+    matches the fundamental to 1 mHz: 1230.769 Hz at 16 kHz is 1/13.
     """
     rate, wanted = exact_frequency(rate_hz), exact_frequency(fundamental_hz)
     share = wanted / rate
@@ -283,7 +283,7 @@ def invert_servo(num: Sequence[float], den: Sequence[float]) -> ServoInverse:
     top = top[delay:]
     blocked = abs(float(top.sum())) <= _NOTHING * float(np.abs(top).sum())
     if blocked:
-        # Apart, because the gain is matched at constants and this zero leaves none there.
+        # Handled separately: the gain is matched at DC, where this zero makes it 0.
         top = np.polydiv(top, [1.0, -1.0])[0]
     zeros = np.roots(top)
     size = np.abs(zeros)
@@ -318,12 +318,12 @@ def invert_servo(num: Sequence[float], den: Sequence[float]) -> ServoInverse:
 def internal_model(
     dt_s: float, period: int, alpha: float, pairs: int, notches_hz: Sequence[float]
 ) -> InternalModel:
-    """Return L with everything checked; frequencies at the rate 1 / `dt_s`.
+    """Return L with checked parameters; frequencies are for the rate 1 / `dt_s`.
 
     Raises
     ------
     Refusal
-        Naming what is out of range.
+        If a parameter is out of range.
     """
     if not 0 < alpha < 1:
         raise Refusal("singular", f"alpha {alpha} must lie between 0 and 1")
@@ -358,7 +358,7 @@ def repetitive_blocks(
     Raises
     ------
     Refusal
-        If the period is shorter than what low-pass and inverse look ahead.
+        If the period is shorter than the look-ahead of low-pass and inverse.
     """
     spare = model.period - model.lead - inverse.preview
     if spare < 0:
@@ -373,7 +373,7 @@ def repetitive_blocks(
 
 
 def instant_margin(loop: Loop, model: InternalModel, harmonics_hz: Sequence[float]) -> Extreme:
-    """Return min 1/|T| in closed form: around a narrow notch T runs through a circle.
+    """Return min 1/|T| in closed form: around a narrow notch T follows a circle.
 
     Its diameter is from T0 to T0 + S0 q, q the low-pass there; so the largest |T| of a notch is
     |T0 + S0 q / 2| + |S0 q / 2|. Exact for a -> 1, without the inverse's error.
@@ -386,7 +386,7 @@ def instant_margin(loop: Loop, model: InternalModel, harmonics_hz: Sequence[floa
 
 
 def periodic_residual(servo: Complex, factor: Complex, amplitudes: Sequence[float]) -> float:
-    """Return the rms of y under sin waves at the plant's input, at the same frequencies."""
+    """Return the rms of y under sine disturbances at the plant's input."""
     lines = np.abs(servo * factor) * np.asarray(amplitudes, float)
     return math.sqrt(float(np.sum(lines**2)) / 2)
 

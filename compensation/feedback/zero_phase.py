@@ -2,10 +2,10 @@
 
     r = A(1/z) B-(z) / (z^-m B+(1/z) B-(1)^2) y_d,    y / r = z^-m B+ B- / A
 
-The inverse is `compensation.inversion`'s, of the loop's answer to its reference; here it gets a
-low-pass, its delays and a form to load. Its gain grows to tens of dB: without the low-pass the
-quantum of a reference alone saturates a drive, so the FIR is on unless it is switched off, and
-its cutoff follows from the acceleration that is allowed.
+`compensation.inversion` inverts the loop's response to its reference; this module adds a low-pass,
+delays and a loadable form. The inverse's gain grows to tens of dB: without the low-pass the
+quantisation of a reference alone saturates a drive, so the FIR is on by default, with a cutoff
+that follows from the allowed acceleration.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _PREVIEW = 5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prefilter:
-    """From the desired position to the reference of a loop.
+    """Turns the desired position into the reference of a loop.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class Prefilter:
         return self.inversion.preview + (0 if self.fir is None else len(self.fir) // 2)
 
     def apply(self, y_d: Array) -> Array:
-        """Return the reference for a desired position, shape (n,), known from end to end."""
+        """Return the reference for a completely known desired position, shape (n,)."""
         return self.inversion.apply(y_d, self.fir)
 
     def response(self, f_hz: Array) -> Complex:
@@ -67,7 +67,7 @@ class Prefilter:
 
     @property
     def peak(self) -> Extreme:
-        """Largest gain and where it lies."""
+        """Largest gain and its frequency."""
         f_hz = np.linspace(0, 0.5 / self.dt_s, 8193)
         gain = np.abs(self.response(f_hz))
         at = int(np.argmax(gain))
@@ -75,7 +75,7 @@ class Prefilter:
 
     @property
     def coefficients(self) -> tuple[CoefficientSet, ...]:
-        """What a controller loads: taps, sections and the low-pass, in this order."""
+        """Return the coefficients to load: taps, sections and low-pass, in this order."""
         command = self.inversion.command
         parts = [
             CoefficientSet(
@@ -97,7 +97,7 @@ def design_prefilter(
     cutoff_hz: float | None = None,
     length: int = _PREVIEW,
 ) -> Prefilter:
-    """Invert the loop's answer to its reference.
+    """Invert the loop's response to its reference.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ def design_prefilter(
     kind : str
         See `compensation.inversion.invert`.
     cutoff_hz : float, optional
-        Of the zero-phase FIR; none if left out (see `fir_within`).
+        Of the zero-phase FIR; None: no FIR (see `fir_within`).
     length : int
         l: the FIR looks l samples ahead.
 
@@ -116,7 +116,7 @@ def design_prefilter(
     """
     if length < 1:
         raise DesignError(f"low-pass that looks {length} samples ahead; at least 1 is needed")
-    # The scale of a reference is the user's: the inverse must reach constants exactly.
+    # A reference has physical units: the inverse must have exact DC gain.
     inversion = invert(kind, reference_plant(loop), order=0, unit_dc=True)
     fir = None if cutoff_hz is None else zero_phase_fir(cutoff_hz, loop.dt_s, length)
     return Prefilter(inversion, fir, loop.dt_s)
@@ -129,7 +129,7 @@ def fir_within(
     *,
     length: int = _PREVIEW,
 ) -> Prefilter:
-    """Return the prefilter with the highest cutoff whose reference keeps an acceleration.
+    """Return the prefilter with the highest cutoff that keeps an acceleration limit.
 
     Parameters
     ----------
@@ -164,7 +164,7 @@ def reference_plant(loop: Loop) -> DiscretePlant:
     den = np.asarray(loop.t0_den, float)
     length = max(len(num), len(den))
     top, bottom = (np.pad(p, (0, length - len(p))) / den[0] for p in (num, den))
-    # Controller form; loops are strictly proper, so nothing of the reference passes at once.
+    # Controller canonical form; loops are strictly proper, so D = 0.
     a = np.eye(length - 1, k=-1)
     a[0] = -bottom[1:]
     b = np.eye(1, length - 1)[0]

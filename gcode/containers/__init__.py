@@ -1,1 +1,1 @@
-"""Files that hold G-code in something else: binary G-code and sliced 3MF packages."""
+"""Containers of G-code: binary G-code and sliced 3MF packages."""

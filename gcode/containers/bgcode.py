@@ -90,7 +90,7 @@ class Block:
 
 
 class BinaryGcode:
-    """What a binary file needs to be written anew around another text.
+    """The parts of a binary file needed to write it again with another text.
 
     Metadata and thumbnails are kept byte for byte, but for the slicer's print time if the print
     takes longer.

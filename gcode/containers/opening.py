@@ -1,4 +1,4 @@
-"""Opens any print file as plain G-code, and writes it back in its original container.
+"""Open any print file as plain G-code, and write it back in its original container.
 
 The text is spooled to disk, in files without a name, of which nothing is left even if the process
 is killed.
@@ -31,7 +31,7 @@ _NAMES = {Kind.TEXT: "plain G-code", Kind.BGCODE: "binary G-code", Kind.THREEMF:
 
 @dataclass(frozen=True, slots=True)
 class Container:
-    """What a text came in.
+    """The container of a text.
 
     Attributes
     ----------
@@ -58,7 +58,7 @@ class Container:
             self._packed.delay_s = seconds
 
     def write(self, text: BinaryIO, target: Path, progress: ShareCallback = lambda _: None) -> None:
-        """Write a text in the same kind of container, with the settings and all else of the old.
+        """Write a text in the same kind of container, keeping everything else of the original.
 
         If the text has not changed, the file does not change either.
 
@@ -159,8 +159,8 @@ def rewriting(
     target : Path
         Is written in place: guard it.
     name : Path
-        Where the target will stand; what must wait, waits there. A name of plain G-code, where the
-        source has another, asks for plain G-code.
+        Final path of the target, whose folder holds temporary files. If it is a name of plain
+        G-code and the source's is not, plain G-code is written.
     progress : callable, optional
 
     Raises

@@ -51,7 +51,7 @@ _BROKEN = (
 
 
 class ThreeMf:
-    """What a package needs to be written anew around another text of one plate.
+    """The parts of a package needed to write it again with another text of one plate.
 
     Attributes
     ----------
@@ -119,7 +119,7 @@ class ThreeMf:
 
 
 class _Bounded(io.BufferedReader):
-    """A file of which no more is read at once than a directory of so many members has."""
+    """A file that limits single reads to the largest plausible directory."""
 
     def read(self, size: int | None = -1, /) -> bytes:
         most = _LARGEST_DIRECTORY_BYTES

@@ -1,4 +1,4 @@
-"""What several encoders share with their loops."""
+"""Kernels shared by several encoders."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ Array = NDArray[np.float64]
 
 
 class MoveLimits(NamedTuple):
-    """What a firmware allows every move, without look-ahead; arrays of shape (n,).
+    """Limits of every move in a firmware, without look-ahead; arrays of shape (n,).
 
     Attributes
     ----------
     length_mm : ndarray
-        Of X Y Z, or of filament where these stand.
+        In X Y Z, or of filament if these stand.
     accel_mm_s2, speed_mm_s : ndarray
     junction_mm_s : ndarray
         Highest speed where the move begins.
@@ -48,7 +48,7 @@ def lay_out(
     planned_s: NDArray[np.float64],
     group: NDArray[np.int64],
 ) -> int:
-    """Round segments and put the rests' own moves between them; return how many moves there are.
+    """Round segments, insert the rests' own moves between them; return the number of moves.
 
     Segments that round to no motion are dropped; their time and filament go to a neighbour.
 
@@ -59,7 +59,7 @@ def lay_out(
     groups : ndarray of int64, shape (groups, 3)
         First row, one past the last row, and 1 for a rest.
     asked : ndarray of int64, shape (rows + 1, 4)
-        Where the file wants to be before the first row and after every row, in units.
+        Position in the file before the first row and after every row, in units.
     grid : ndarray of int64, shape (3,)
         Grid of X, Y and Z in units; the last end of every group is what the file wants.
     row, position, move_end_s, planned_s, group : ndarray
@@ -77,7 +77,7 @@ def lay_out(
                 count += 1
             continue
         x0, y0, z0, e0 = asked[first, 0], asked[first, 1], asked[first, 2], asked[first, 3]
-        # Where the file leaves Z alone nobody may name it: it may be off the grid, or not known.
+        # Do not write Z where the file does not: it may be off the grid or unknown.
         level = True
         for r in range(first, last):
             level = level and asked[r + 1, 2] == z0
@@ -100,7 +100,7 @@ def lay_out(
                 x0, y0, z0, e0 = x, y, z, e
                 count += 1
             elif final and count > begun:
-                # Nothing follows in this stretch: the segment before takes filament and time.
+                # The last of its stretch: the previous segment takes its filament and time.
                 position[count - 1, 3] = e
                 move_end_s[count - 1], planned_s[count - 1] = end_s[at], end_s[at] - begin_s
             at += 1

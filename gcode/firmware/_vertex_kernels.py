@@ -1,14 +1,14 @@
 """Choose vertices on whole motor steps whose rounding disturbs the printer's motion least.
 
-A place on whole steps lies up to half a step beside the command. When the motion passes there is
-free, though, so what counts is the distance across, and of the places around a command in motion
-one lies near it. Where none does, the errors are made to take turns, so that what the printer
-follows cancels. And where the firmware executes no move of fewer than some steps, somebody has to
-choose which vertices to leave out.
+A place on whole steps is up to half a step off the command. The time at which the motion passes it
+is free, though, so only the distance across the path matters, and of the places around a moving
+command one is usually close. Where none is, errors alternate, so that the printer's response to
+them cancels. Where the firmware executes only moves of some steps or more, vertices must be left
+out.
 
-The error of a segment moves the printer long after: so all of a stretch is one shortest path
-(Viterbi, 1967) over times and places, each carrying the printer's state. Of the ways that end at
-about one time only the best few are followed on.
+The error of a segment excites the printer long after it, so a whole stretch is solved as one
+shortest path (Viterbi, 1967) over times and places, each with the printer's state. Of the paths
+that end at about the same time, only the best few are continued.
 """
 
 from __future__ import annotations
@@ -35,31 +35,31 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 MOST_PLACES = 13
-"""Places that are tried for a vertex in a slow place; in others it is `_PLACES`."""
+"""Candidate places of a vertex in slow motion; elsewhere `_PLACES`."""
 _PLACES = 8
 _BESIDE = 2
-"""How many steps, along X and Y together, the former lie beside the nearest one."""
+"""Largest distance of the former from the nearest one, in steps of X and Y together."""
 _REACH = 2.0
-"""How much earlier or later a vertex may come, in samples."""
+"""Largest shift in time of a vertex, in samples."""
 _WAYS = 4
-"""Ways that are followed on from a vertex."""
+"""Paths continued from a vertex."""
 _LOOK_BACK, _LOOK_BACK_SLOW = 2, 4
 """Earlier vertices that a segment may come from, counted from the nearest that is far enough."""
 _LONG, _LONGEST = 25.0, 1000.0
-"""Samples. Longer segments are tried only where there is none shorter, and longer ones not at all:
-there the command moves by less than 0.1 mm/s."""
+"""Samples. Segments longer than the first are tried only if there is none shorter, and longer than
+the second never: the command then moves by less than 0.1 mm/s."""
 _SHORT = 0.5
 _NEARLY_BACK = 0.9999
 _JOLT = 20.0
-"""Samples. What makes steps of an excess of speed; large, so that there is none where it can be."""
+"""Samples. Cost of excess speed steps; large, so that they are avoided where possible."""
 _GENTLE = 0.2
-"""What a step of speed beyond gentle ramps counts in a fast place, one beyond all ramps being 1."""
+"""Cost, in fast motion, of a speed step beyond gentle ramps, relative to one beyond all ramps."""
 _SEEN = 0.1
-"""What the square of an error counts by itself, that of the printer's answer being 1."""
+"""Weight of a squared error itself, relative to that of the printer's response."""
 _ALONG = 0.1
-"""What a square along the path counts, one across it being 1: only the latter is seen on a part."""
+"""Weight of squares along the path relative to those across it, which show on a part."""
 _FAR = 1.2
-"""What a squared error is above that, in steps of X, counts too, wherever the error points."""
+"""The excess of a squared error over this, in steps of X, counts whatever its direction."""
 
 
 class Places(NamedTuple):
@@ -71,7 +71,7 @@ class Places(NamedTuple):
     at : ndarray, shape (n, MOST_PLACES)
         When, in samples.
     counts : ndarray of int64, shape (n,)
-        How many they are.
+        Number of places.
     slow : ndarray of bool, shape (n,)
         A vertex or one beside it is nearer to its neighbour than the least steps of a move.
     """
@@ -83,19 +83,19 @@ class Places(NamedTuple):
 
 
 class Rules(NamedTuple):
-    """What moves must be like.
+    """Constraints on moves.
 
     Attributes
     ----------
     least : int
-        Steps that vertices are apart at least.
+        Least distance of vertices in steps.
     unit : ndarray, shape (2,)
-        How long a step of X and one of Y are, in steps of X.
+        Length of a step of X and of Y, in steps of X.
     step : ndarray, shape (2,)
         By how much the step rates of X and Y (of a CoreXY's motors), in steps per sample, may step
         at a vertex; more is made to cost much.
     spare : float
-        How many steps within a segment rounding may add to that.
+        Steps within a segment that rounding may add to that.
     bend : ndarray, shape (3,)
         Acceleration in steps of X per sample^2. A step of speed is a ramp, or a bend, within the
         shorter of two segments; what does not fit is made to cost as much. Then a gentle
@@ -113,7 +113,7 @@ class Rules(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """The printer's answer to an error e, for X and for Y.
+    """The printer's response to an error e, for X and for Y.
 
     It is direct e + sum of Re(weight x), x <- pole x + e.
 
@@ -123,7 +123,7 @@ class Answer(NamedTuple):
         Real and imaginary parts take turns.
     direct : ndarray, shape (2,)
     energy : ndarray, shape (2, 2 order, 2 order)
-        Energy of what states answer from now on, as a quadratic form of their parts.
+        Energy of the future response of the states, as a quadratic form of their parts.
     """
 
     pole: Array
@@ -133,24 +133,24 @@ class Answer(NamedTuple):
 
 
 class _Search(NamedTuple):
-    """What is known of the ways to every place.
+    """The best paths to every place so far.
 
     Attributes
     ----------
     cost : ndarray, shape (n, MOST_PLACES)
-        Of the best way to a place, infinite to begin with.
+        Cost of the best path to a place, initially infinite.
     rank : ndarray, shape (n, MOST_PLACES)
-        The cost and what is still to come of it, infinite to begin with.
+        The cost plus that of the remaining response, initially infinite.
     came : ndarray of int64, shape (n, MOST_PLACES)
-        Vertex and place that the best way comes from, or -1.
+        Vertex and place from which the best path comes, or -1.
     states : ndarray, shape (n, MOST_PLACES, 4 order)
-        The printer's there, X's before Y's.
+        The printer's states there, X before Y.
     ways : ndarray of int64, shape (n, _WAYS)
-        Places that are followed on from a vertex, the best first.
+        Places from which paths continue, the best first.
     n_ways : ndarray of int64, shape (n,)
-        How many they are, none to begin with.
+        Their number, initially 0.
     x, kept : ndarray, shapes (4 order,) and (_WAYS,)
-        Room to work in.
+        Work space.
     """
 
     cost: Array
@@ -165,14 +165,14 @@ class _Search(NamedTuple):
 
 @kernel(inline=True)
 def hop(dx: Any, dy: Any, dz: Any, corexy: bool) -> Any:
-    """Count the steps of the motor that makes the most of them."""
+    """Return the largest number of steps of a motor."""
     across = abs(dx) + abs(dy) if corexy else max(abs(dx), abs(dy))
     return max(across, abs(dz))
 
 
 @kernel(inline=True)
 def nearly_back(ax: float, ay: float, bx: float, by: float) -> bool:
-    """Tell whether a move b goes straight back along the move a before it."""
+    """Return whether move b goes straight back along the preceding move a."""
     dot = ax * bx + ay * by
     return dot < 0.0 and dot * dot >= _NEARLY_BACK**2 * (ax * ax + ay * ay) * (bx * bx + by * by)
 
@@ -377,7 +377,7 @@ def _follow(
                     far = alone or hop(bx, by, z[k] - z[j], corexy) >= least
                     if span < _SHORT or not far:
                         continue
-                    # What would not be followed on need not be known.
+                    # Skip paths that would not be continued.
                     total, most = cost[j, d], min(rank[k, c], kept[_WAYS - 1])
                     if total >= most:
                         some = True
@@ -389,7 +389,7 @@ def _follow(
                     jump = spare * (per + rounding)
                     dx, dy = bx * per - rate_x, by * per - rate_y
                     total += _jolt(dx, dy, jump, step, corexy)
-                    # From a stand the mean speed of a ramp is half of what it reaches.
+                    # From standstill, the mean speed of a ramp is half its final speed.
                     room = bend[0] * (min(span, lasts) if i >= 0 else 0.5 * span)
                     total += _crowded(dx * unit[0], dy * unit[1], room)
                     if gentle < 1.0 and _fastest(bx, by, rate_x, rate_y, per, corexy) > bend[2]:
@@ -446,7 +446,7 @@ def _follow(
                         for q in range(width):
                             states[k, c, q] = x[q]
             found += int(some)
-        # The best first: then the others of a vertex are soon seen to be worse.
+        # The best path first, so that the others of a vertex are rejected early.
         for way in range(_WAYS):
             best = -1
             for c in range(count[k]):
@@ -473,7 +473,7 @@ def _follow(
 
 @kernel(inline=True)
 def _keep(kept: Any, old: float, new: float) -> None:
-    """Put a rank in the place of an older and larger one, or of the largest; they rise."""
+    """Replace an older, larger rank, or the largest one; ranks stay sorted."""
     at = len(kept) - 1
     for i in range(len(kept)):
         if kept[i] == old:
@@ -498,7 +498,7 @@ def _jolt(dx: float, dy: float, rounding: float, most: Any, corexy: bool) -> flo
 
 @kernel(inline=True)
 def _crowded(dx: float, dy: float, most: float) -> float:
-    """Cost of a step of speed, steps of X per sample, for which there is not the time."""
+    """Cost of a speed step, in steps of X per sample, for which there is too little time."""
     excess = np.sqrt(dx * dx + dy * dy) - most
     return (_JOLT * excess) ** 2 if excess > 0.0 else 0.0
 
@@ -512,7 +512,7 @@ def _fastest(bx: float, by: float, rx: float, ry: float, per: float, corexy: boo
 
 @kernel(inline=True)
 def _at(command: Any, t: float) -> tuple[float, float]:
-    """Find X and Y between samples."""
+    """Interpolate X and Y between samples."""
     k = min(max(int(t), 0), len(command) - 2)
     w = t - k
     return (
@@ -523,7 +523,7 @@ def _at(command: Any, t: float) -> tuple[float, float]:
 
 @kernel(inline=True)
 def _fed(command: Any, t: float) -> float:
-    """Find the filament between samples."""
+    """Interpolate the filament between samples."""
     k = min(max(int(t), 0), len(command) - 2)
     return float(command[k, 2] + (t - k) * (command[k + 1, 2] - command[k, 2]))
 
@@ -535,7 +535,7 @@ def _passing(
     """When the command, about v at t, is nearest to a place; how far, to the left above 0."""
     square = vx * vx + vy * vy
     x0, y0 = _at(command, t)
-    # At a creep, the nearest time says nothing.
+    # In very slow motion, the nearest time is meaningless.
     if square > 0.0025:
         t = min(max(t + ((x - x0) * vx + (y - y0) * vy) / square, begin), end)
     x0, y0 = _at(command, t)

@@ -1,4 +1,4 @@
-"""The text of G1 lines."""
+"""Kernels that format G1 lines."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ __all__ = ["format_moves", "printed_feedrate"]
 
 
 _LEADING = np.array([[*f"{n:<3}".encode(), len(str(n))] for n in range(1000)], np.uint8)
-"""Digits of 0 to 999 as they begin a number, and how many there are."""
+"""Digits of 0 to 999 without leading zeros, and their count."""
 _TRAILING = np.array(
     [[*b"%03d" % n, len((b"%03d" % n).rstrip(b"0"))] for n in range(1000)], np.uint8
 )
-"""The same with all three digits, and how many there are without trailing zeros."""
+"""The same with all three digits, and their count without trailing zeros."""
 
 
 @kernel(inline=True)
@@ -29,8 +29,8 @@ def printed_feedrate(f: float) -> float:
 def _put_number(buffer: NDArray[np.uint8], at: int, millionths: int) -> int:
     """Write ``millionths / 1e6`` without trailing zeros; returns the next free byte.
 
-    Three digits at a time: which of them count is looked up as well, so that nothing depends on a
-    guess how long numbers are. Up to two more bytes are overwritten.
+    Three digits at a time, with their count from the table, which avoids mispredicted branches. Up
+    to two more bytes are overwritten.
     """
     if millionths < 0:
         buffer[at] = 45

@@ -1,8 +1,7 @@
-"""Interface of a firmware to the pipeline: its planner, and how it is made to execute a stream.
+"""Interface of a firmware to the pipeline: its planner, encoder and commands for a stream.
 
-`FirmwareAdapter` is the seam. The pipeline asks `gcode.firmware.registry.adapter` for the adapter
-of a machine and knows no firmware by name; whatever differs between firmwares is behind these
-protocols.
+The pipeline gets the `FirmwareAdapter` of a machine from `gcode.firmware.registry.adapter` and
+knows no firmware by name; all differences between firmwares are behind these protocols.
 """
 
 from __future__ import annotations
@@ -70,7 +69,7 @@ class Planner(Protocol):
         """Come to rest after the last move and stand for `dwell_s`."""
 
     def flush(self) -> Phases:
-        """Come to rest; return all that is left."""
+        """Come to rest; return the remaining phases."""
 
 
 class Encoder(Protocol):
@@ -81,7 +80,7 @@ class Encoder(Protocol):
         """Grid of the X and Y that it writes; the segments are fitted on it."""
 
     def rest_durations(self, piece: Piece, groups: Sequence[Group]) -> NDArray[np.float64]:
-        """First guess of how long each rest takes between stretches of the stream."""
+        """Return a first estimate of the duration of each rest between stretches."""
 
     def encode(self, piece: Piece, timeline: Timeline, segments: Segments) -> Encoded:
         """Choose rounded positions and feedrates.
@@ -89,20 +88,20 @@ class Encoder(Protocol):
         Raises
         ------
         GcodeError
-            When the firmware would refuse a move.
+            If the firmware would refuse a move.
         """
 
 
 class StreamCommands(Protocol):
-    """The words of one firmware that the writer of the stream needs."""
+    """The commands of a firmware that are needed to write a stream."""
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Lines of the header that tell a person what to mind."""
+        """Lines of the header with advice for users."""
 
     @property
     def stand_still(self) -> bytes:
-        """A line that waits until all motion has ended and changes nothing."""
+        """A line that waits for the end of motion and changes nothing."""
 
     @property
     def positioning_sets_extruder(self) -> bool:
@@ -110,7 +109,7 @@ class StreamCommands(Protocol):
 
     @property
     def one_command(self) -> bool:
-        """A second G or M in a line is no command of its own (not so in RepRapFirmware)."""
+        """A line has only one command (RepRapFirmware allows several)."""
 
     @property
     def ignores_subcodes(self) -> bool:
@@ -118,7 +117,7 @@ class StreamCommands(Protocol):
 
     @property
     def factors_need_axes(self) -> bool:
-        """M220 and M221 do not hold for moves of the extruder alone (RepRapFirmware)."""
+        """M220 and M221 do not apply to moves of the extruder alone (RepRapFirmware)."""
 
     @property
     def folds_case(self) -> bool:
@@ -126,7 +125,7 @@ class StreamCommands(Protocol):
 
     @property
     def coarse_extruder(self) -> bool:
-        """Relative E adds up in 32-bit floats: far from 0 small moves lose digits (Marlin)."""
+        """Relative E is summed in 32-bit floats, so small moves far from 0 lose digits (Marlin)."""
 
     @property
     def shaper_off(self) -> bytes:
@@ -134,11 +133,11 @@ class StreamCommands(Protocol):
 
     @property
     def shaper_on(self) -> bytes | None:
-        """Lines that set it to what the machine states; None: the machine does not say."""
+        """Lines that restore the machine's stated shaper; None: it states none."""
 
     @property
     def file_shaper_off(self) -> bytes:
-        """Lines that switch off a shaper that the file has set, whatever the machine states."""
+        """Lines that switch off a shaper set by the file, whatever the machine states."""
 
     def shaped_axes(self, line: bytes) -> str:
         """Return the axes, of X and Y, whose frequency a line that sets the shaper states."""
@@ -147,11 +146,11 @@ class StreamCommands(Protocol):
         """Lines that set pressure advance of the tool in use, if `shaper_off` turns it off."""
 
     def advance_aside(self, limits: Limits) -> bytes:
-        """Lines that set pressure advance while the shaper stays off; empty: it is on, or 0."""
+        """Return lines that set pressure advance while the shaper is off; empty: not needed."""
 
     @property
     def advance_off(self) -> bytes:
-        """Lines after which it is off again, if the limits of a stream do not see to it."""
+        """Return lines that switch it off again, if the limits of a stream do not."""
 
     def conflict(self, line: bytes) -> str | None:
         """Return why a line must not stand in a file with a stream; None: it may."""
@@ -170,14 +169,14 @@ class StreamCommands(Protocol):
 
 
 class Adviser(Protocol):
-    """Words that set the firmware's own shaper and the acceleration of moves that print.
+    """Commands for the firmware's own shaper and the acceleration of printing moves.
 
     Lines come without their ends, so that a comment can follow.
     """
 
     @property
     def shapers(self) -> tuple[str, ...]:
-        """Types that a file may set, by our names (`models.shaper_pulses`); empty: none."""
+        """Shaper types that a file may set, by our names (`models.shaper_pulses`)."""
 
     @property
     def shaper_word(self) -> str:
@@ -193,7 +192,7 @@ class Adviser(Protocol):
 
     @property
     def skips_lines(self) -> bool:
-        """Of an object that is left out it passes over all lines, not the moves alone (Bambu)."""
+        """For an excluded object it skips all lines, not only moves (Bambu)."""
 
     @property
     def highest_mm_s2(self) -> float:
@@ -226,7 +225,7 @@ class Adviser(Protocol):
 
 
 class FirmwareAdapter(Protocol):
-    """What one firmware offers for one machine."""
+    """Everything that the pipeline needs of one machine's firmware."""
 
     @property
     def refusal(self) -> str | None:
@@ -236,12 +235,12 @@ class FirmwareAdapter(Protocol):
     def step_mm(self) -> tuple[float, float, float, float]:
         """Largest distance x y z e between a commanded position and where the machine stops.
 
-        0 for a firmware that keeps places to the last digit of the file, one step otherwise.
+        0 for a firmware that keeps positions exactly, one step otherwise.
         """
 
     @property
     def shortest_move_mm(self) -> float:
-        """Length in X Y below which a move is merged with its neighbours; 0: none is."""
+        """Length in XY below which a move is merged with its neighbours; 0: never."""
 
     @property
     def extruder_alone_stops(self) -> bool:
@@ -270,7 +269,7 @@ class FirmwareAdapter(Protocol):
         speed : float
             Ratio of the speed limits.
         most : CommandLimits
-            What no limit rises above; one that the file has set higher stays.
+            Upper bound of the limits; higher ones set by the file stay.
 
         Notes
         -----
@@ -280,19 +279,18 @@ class FirmwareAdapter(Protocol):
     def planner(self, *, rests_apart: bool = False) -> Planner:
         """Return a planner at rest.
 
-        A firmware may join moves that are too short for it with the next one. With `rests_apart`
-        it does not where that is of Z or of the extruder alone, so that rests are what they are in
-        the file.
+        A firmware may merge moves that are too short into the next one. With `rests_apart` it does
+        not if that is of Z or the extruder alone, so that rests stay as in the file.
         """
 
     def encoder(self) -> Encoder:
         """Return an encoder of the stream."""
 
     def stream_commands(self) -> StreamCommands:
-        """Return the words of the firmware."""
+        """Return the stream commands of the firmware."""
 
     def adviser(self, dialect: Dialect) -> Adviser:
-        """Return its words for shaper and acceleration, for files read by a dialect."""
+        """Return its commands for shaper and acceleration, for files of a dialect."""
 
     def too_steep(self, travel_mm: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Mark moves that climb so steeply that a stream could not keep their times.
@@ -307,14 +305,14 @@ class FirmwareAdapter(Protocol):
 def corner_step_mm_s(command: CommandLimits) -> float:
     """Return the largest step of velocity that the firmware may make at a corner of a stream.
 
-    A stream runs under the motors' own acceleration and such corners, so that it may break off at
-    any line and go on from there: braking and starting again, the firmware keeps its limits.
+    A stream runs under the motors' own acceleration and such corners, so that it may be interrupted
+    at any line: braking and starting again, the firmware keeps its limits.
     """
     return _CORNER_SHARE * command.speed_step_mm_s
 
 
 def square_corner_mm_s(command: CommandLimits) -> float:
-    """Return the same as the speed through a square corner, which junction deviation goes by.
+    """Return the same as a square corner velocity, on which junction deviation is based.
 
     Around a small angle t velocity steps most: the speed there is s sqrt(8 (sqrt(2) - 1)) / t
     (klippy/toolhead.py `calc_junction`, 2026-08), s being the speed through a square corner.
@@ -323,5 +321,5 @@ def square_corner_mm_s(command: CommandLimits) -> float:
 
 
 def scaled(value: float, ratio: float, most: float) -> float:
-    """Return `ratio` times a limit, which rises to `most` and not above; higher ones stay."""
+    """Return `ratio` times a limit, raised to at most `most`; higher limits stay."""
     return min(ratio * value, max(value, most))

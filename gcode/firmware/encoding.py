@@ -1,4 +1,4 @@
-"""Parts that all encoders share: the encoded piece, and how it is assembled."""
+"""The encoded piece, and functions shared by all encoders to assemble it."""
 
 from __future__ import annotations
 
@@ -42,18 +42,18 @@ class Encoded:
     row : ndarray of int64, shape (n,)
         Row of the piece for a rest's own move, -1 for a segment of ours.
     limits : sequence of Limits
-        What our segments run under, one or the other.
+        Limits of our segments.
     level : ndarray of int64, shape (n,)
-        Which of them, for every segment of ours.
+        Index into `limits` for every segment of ours.
     feedrate_mm_min : ndarray, shape (n,)
     start_s : ndarray, shape (n,)
         When each move begins, counted as on the timeline.
     group_start_s : ndarray, shape (groups,)
-        When each group begins; rests move the groups after them a little.
+        Start of each group; rests shift the groups after them slightly.
     row_start_s : ndarray, shape (rows of the piece,)
         When each original move begins on the timeline.
     rest_s : ndarray, shape (groups,)
-        How long each rest takes.
+        Duration of each rest.
     phases : Phases
         The firmware's plan of the moves.
     """
@@ -113,7 +113,7 @@ def interleave(
         stretch that does not climb the height that it has. Segments that round to no motion give
         their time and filament to a neighbour.
     """
-    # Where the file wants to be; a firmware that counts steps is there but for a part of a step.
+    # Positions in the file; a firmware that counts steps is off by a fraction of a step.
     asked = to_units(np.vstack([piece.moves.start_mm[:1], piece.moves.end_mm]))
     room = len(segments) + len(piece.moves)
     row, group = np.empty((2, room), np.int64)
@@ -151,7 +151,7 @@ def limits_in_force(
         Row of the piece for a rest's own move, -1 for a segment.
     stream : sequence of Limits
     level : ndarray of int64, shape (n,)
-        Which of them a segment runs under.
+        Index into `stream` for each segment.
     """
     own = rows >= 0
     used, found = np.unique(piece.moves.limits_id[rows[own]], return_inverse=True)
@@ -168,7 +168,7 @@ def as_moves(
 ) -> Moves:
     """Return moves for a planner from places (n, 4), speeds (n,) and rows of a table (n,).
 
-    Their lines count from 1 and stand for nothing.
+    Their line numbers count from 1 and have no meaning.
     """
     n = len(speed_mm_s)
     zeros, none = np.zeros(n, np.int32), np.full(n, -1, np.int32)

@@ -1,4 +1,4 @@
-"""The firmware's input shaper as the file itself sets it."""
+"""Track the firmware's input shaper as set by the file itself."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _ADVANCE, _FURTHER_SHAPER = "M572", re.compile(rb"M593(?!\d)", re.IGNORECASE)
 
 
 class FileShapers:
-    """Lines of the file that set the shaper, to say them again after a stream.
+    """Lines of the file that set the shaper, to be repeated after a stream.
 
     Attributes
     ----------
@@ -28,7 +28,7 @@ class FileShapers:
         """Commands that set a shaper: number of the first line, and how many."""
 
     def note(self, line: bytes, number: int) -> None:
-        """Note a line that sets the shaper, or pressure advance, which is no shaper."""
+        """Record a line that sets the shaper or pressure advance."""
         words = NUMBERED.sub(b"", line).split()
         name = words[0].decode("ascii", "replace").upper() if words else ""
         if name.startswith(_ADVANCE):
@@ -43,7 +43,7 @@ class FileShapers:
 
     @property
     def said(self) -> str:
-        """Which commands of the file set a shaper, and where; often none."""
+        """Return which commands of the file set a shaper, and where; often empty."""
         return ", ".join(
             f"{name} (line {line}{f' and {count - 1} more' if count > 1 else ''})"
             for name, (line, count) in self._names.items()

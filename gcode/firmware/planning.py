@@ -1,4 +1,4 @@
-"""Parts that all planners share."""
+"""Functions shared by all planners: stops, limits on durations, intended motion."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ STOPPING = frozenset({EventKind.STOP, EventKind.UNKNOWN, EventKind.SHAPER})
 """Events at which the motion comes to rest."""
 
 LONGEST_MOVE_S = 1200.0
-"""A single move that takes longer is taken for a mistake; a bed that is lowered takes minutes."""
+"""Longer single moves are considered a mistake; lowering a bed takes minutes."""
 LONGEST_PRINT_S = 3.6e6
 """Longer prints are refused: a small file must not keep a computer busy for days."""
 
 _HALF = 0.501
-"""Half a step, the most that rounding changes, with room for the last digits."""
+"""Half a step, the largest rounding error, plus a tolerance."""
 
 _STOPS = np.array([kind in STOPPING for kind in EventKind])
 """Whether the motion rests, indexed by the number of an event's kind."""
@@ -49,9 +49,9 @@ def intended(
     end_mm: NDArray[np.float64],
     step_mm: Sequence[float],
 ) -> Phases:
-    """Return a plan whose moves end in X and Y where the file says instead of on motor steps.
+    """Return a plan whose moves end in X and Y at the file's positions instead of on motor steps.
 
-    What the firmware makes of a file, in its times, but for the rounding to whole steps: that is
+    It is the firmware's plan with its timing, but without rounding to whole steps, which counts as
     an error like any other.
 
     Parameters
@@ -68,7 +68,7 @@ def intended(
     half_step_mm = _HALF * np.asarray(step_mm[:2])
 
     def rounded_by(told_mm: NDArray[np.float64], there_mm: NDArray[np.float64]) -> Any:
-        # Farther is no rounding: a move that was swallowed, say.
+        # Larger differences are not rounding (a swallowed move, for example).
         by_mm = told_mm[..., :2] - there_mm[..., :2]
         return np.where(np.all(np.abs(by_mm) <= half_step_mm, axis=-1, keepdims=True), by_mm, 0.0)
 
@@ -127,9 +127,9 @@ def check_print_ends(time_s: float, line: int) -> None:
 
 
 def between_stops(block: ProgramBlock) -> Iterator[tuple[int, int, float | None]]:
-    """Yield the rows [first, end) of moves between stops, and for how long it then stands.
+    """Yield the rows [first, end) of moves between stops, and the dwell after them.
 
-    None: the block ends there and the motion goes on.
+    None: the block ends there without a stop.
     """
     events = block.events
     begun = 0

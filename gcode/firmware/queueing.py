@@ -1,4 +1,4 @@
-"""The queue of all planners, in which moves wait until their speeds are final."""
+"""Base class of the planners: a queue in which moves wait until their speeds are final."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["QueuePlanner", "with_motion"]
 
 _ROWS = 1024
 _LARGE_TABLE = 64
-"""A file may change limits thousands of times: of so long a table only the rows in use are read."""
+"""Size of a table of limits above which only the rows in use are read."""
 
 
 class QueuePlanner(ABC):
@@ -25,7 +25,7 @@ class QueuePlanner(ABC):
     Parameters
     ----------
     columns : int
-        Numbers that the firmware's kernels keep of each waiting move.
+        Numbers per waiting move in the firmware's kernels.
     """
 
     def __init__(self, columns: int) -> None:
@@ -110,7 +110,7 @@ class QueuePlanner(ABC):
         self._begun = self._begun or self._count > 0
 
     def _due(self) -> bool:
-        """Whether it is worth while to look for settled moves."""
+        """Return whether it is worthwhile to look for settled moves."""
         return True
 
     @abstractmethod

@@ -1,4 +1,4 @@
-"""Recognises files of this program whose comments somebody has stripped."""
+"""Recognise files of this program whose comments were removed."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ _SIGNED = re.compile(rb"\n(?:%b)" % b"|".join(_SIGNATURES))
 
 
 def signed_at(text: bytes) -> int | None:
-    """Return the place of limits that only this program writes, or None.
+    """Return the offset of limits that only this program writes, or None.
 
-    Any firmware's: a file for one machine does not become sliced by being read for another.
+    All firmwares are checked: the file may have been written for another machine.
     """
     found = _SIGNED.search(text)
     return None if found is None else found.start() + 1

@@ -1,6 +1,6 @@
-"""Places the vertices of a stream on whole steps: which ones, where and when.
+"""Place the vertices of a stream on whole steps: which ones, where and when.
 
-`_vertex_kernels.py` says how they are chosen.
+`_vertex_kernels.py` describes the method.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from stillpath.gcode.timeline import Timeline
 __all__ = ["Lattice", "steps_within", "vertices_on_steps"]
 
 _FILAMENT_MM = 0.01
-"""An error of the filament that counts as much as a step of X."""
+"""Filament error that counts as much as a step of X."""
 _OFTEN_S = 4e-3
-"""Straight lines get a vertex that often, to lie on the command in the mean."""
+"""Largest spacing of vertices on straight lines, so that errors average out."""
 
 
 @dataclass(frozen=True, slots=True)
 class Lattice:
-    """Where a machine's vertices may lie, and what its moves must be like.
+    """Grid of a machine's vertices, and constraints on its moves.
 
     Attributes
     ----------
@@ -47,13 +47,13 @@ class Lattice:
     speed_step_mm_s : float
         Largest step of a motor's speed.
     spare_steps : float
-        So many steps within a segment may rounding add to that.
+        Steps within a segment that rounding may add to that.
     accel_mm_s2 : float
-        That the moves are executed with.
+        Acceleration of the moves.
     moves_per_s : float
-        As many moves come in.
+        Rate at which moves arrive.
     fast_mm_s, fast_accel_mm_s2 : float
-        Acceleration that moves should need no more than where a motor is faster than that.
+        Motor speed above which moves should need no more than this acceleration.
     """
 
     per_mm: NDArray[np.float64]
@@ -69,7 +69,7 @@ class Lattice:
     fast_accel_mm_s2: float = np.inf
 
     def rules(self, dt_s: float) -> Rules:
-        """Return what moves must be like, in steps and samples."""
+        """Return the constraints on moves in steps and samples."""
         scale, step, step2 = self.per_mm, self.per_mm[0] * dt_s, self.per_mm[0] * dt_s**2
         accel, gentle = self.accel_mm_s2, self.fast_accel_mm_s2
         return Rules(
@@ -94,7 +94,7 @@ def steps_within(
     per_mm : ndarray, shape (2 or more,)
     """
     low_mm, high_mm = np.transpose(travel_mm)
-    # But for the rounding of decimals.
+    # With a margin for rounding.
     low, high = low_mm * per_mm[:2] - 1e-6, high_mm * per_mm[:2] + 1e-6
     return np.ceil(low).astype(np.int64), np.floor(high).astype(np.int64)
 

@@ -1,4 +1,4 @@
-"""Writes the file: our lines among those of the original, keeping track of the printer's state.
+"""Write our lines among those of the original, keeping track of the printer's state.
 
 Lines of the original are written byte for byte. Whatever the stream needs different (limits, modes,
 firmware shaper) is set before its first line, and restored before any line that may depend on it.
@@ -33,21 +33,21 @@ from stillpath.gcode.types import EventKind, Limits, ModalState
 __all__ = ["FILE_SETS_SHAPER", "StreamWriter"]
 
 FILE_SETS_SHAPER = "The file sets the firmware's input shaper"
-"""How the warning begins."""
+"""Beginning of the warning."""
 
 _BYTES_PER_LINE = 96
 _LEVEL, _EVENT, _REST = range(3)
 _SHAPED = (EventKind.UNKNOWN, EventKind.SHAPER)
 _LEAST_GAP_MM = 1e-7
 _FAR_MM = 10.0
-"""32-bit floats hold a micrometre up to here."""
+"""32-bit floats resolve a micrometre up to here."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Modes:
     """Modal states of a piece's written moves: states[i] holds from move first[i] on.
 
-    They are the file's, but for X Y Z absolute and E relative, as our lines are.
+    They are the file's, except that our lines use absolute X Y Z and relative E.
     """
 
     first: NDArray[np.int64]
@@ -64,7 +64,7 @@ class StreamWriter:
     ----------
     firmware : FirmwareAdapter
     stamp : str
-        Says who processed the file; one line in header and footer.
+        Version and options; one line in header and footer.
     """
 
     def __init__(self, firmware: FirmwareAdapter, stamp: str) -> None:
@@ -72,7 +72,7 @@ class StreamWriter:
         self._lines = LineReader(self._stream_commands)
         self._extruder_alone_stops = firmware.extruder_alone_stops
         self._limits_now: Limits | None = None
-        """What the printer plans with, while streaming."""
+        """The planner's limits while streaming."""
         self._stamp = stamp
         self._streaming = False
         self._shaper_off = False
@@ -83,9 +83,9 @@ class StreamWriter:
         self._file_shapers = FileShapers()
         self._at_rest = True
         self._modal: ModalState | None = None
-        """What the printer's modes are now, where they may differ from the file's."""
+        """The printer's modes, where they may differ from the file's."""
         self._far_mm: float | None = None
-        """What the printer's E reads, where it must be set to 0 before a stream goes on."""
+        """The printer's E, if it must be set to 0 before a stream continues."""
         self._zero_mm = 0.0
         """The file's E where the printer's reads 0."""
         self._file_feed_mm_min = 0.0
@@ -110,7 +110,7 @@ class StreamWriter:
 
     @property
     def switching_off(self) -> bytes:
-        """Lines that a piece that comes now begins with to switch the shaper off; often none."""
+        """Lines at the start of a piece that switch the shaper off; often none."""
         if self._streaming:
             return b""
         if self._shaper_off:
@@ -119,27 +119,27 @@ class StreamWriter:
         return off or (self._stream_commands.file_shaper_off if self._file_shapers.lines else b"")
 
     def header(self) -> bytes:
-        """Lines that say who processed the file, and what to mind."""
+        """Return lines that say who processed the file, and what to note."""
         notes = "".join(f"; stillpath: {note}\n" for note in self._stream_commands.notes)
         return self.footer() + notes.encode()
 
     def footer(self) -> bytes:
-        """Line that says who processed the file."""
+        """Return the line that says who processed the file."""
         return f"; Processed by stillpath {self._stamp}\n".encode()
 
     def end(self, ends_with_newline: bool, extruder_mm: float) -> bytes:
-        """Lines that give the printer back at the end of the file; often none."""
+        """Return lines that restore the printer's state at the end of the file; often none."""
         text = self._end(extruder_mm)
         return text if ends_with_newline or not text else b"\n" + text
 
     def verbatim(self, verbatim: VerbatimPart, extruder_mm: float) -> bytes:
-        """Text of lines that are not changed.
+        """Return the text of unchanged lines, with our own lines before them if needed.
 
         Parameters
         ----------
         verbatim : VerbatimPart
         extruder_mm : float
-            What the printer takes for E after all that was written before.
+            The printer's E after everything written so far.
 
         Raises
         ------
@@ -156,7 +156,7 @@ class StreamWriter:
             if conflict is not None:
                 raise GcodeError(conflict, line=int(events.line[row]))
             if events.kind[row] != EventKind.SHAPER or self._lines.is_move(line.split(b";", 1)[0]):
-                continue  # a line that moves too cannot be said again
+                continue  # a line that also moves cannot be repeated
             self._shaper_off = False
             self._file_shapers.note(line, int(events.line[row]))
         if len(moves):
@@ -168,7 +168,7 @@ class StreamWriter:
         return lead + verbatim.text
 
     def piece(self, piece: Piece, encoded: Encoded, extruder_mm: float) -> bytes:
-        """Text of a compensated piece; `extruder_mm` is that of `verbatim`."""
+        """Return the text of a compensated piece; `extruder_mm` as in `verbatim`."""
         self._reads(extruder_mm)
         limits, level = encoded.limits, encoded.level
         parts = [self._on(piece, limits[level[0]])]
@@ -206,7 +206,7 @@ class StreamWriter:
         return b"".join(parts)
 
     def _event_places(self, piece: Piece, encoded: Encoded) -> NDArray[np.int64]:
-        """Index of the written move before which each event of the piece stands."""
+        """Return the index of the written move before which each event is written."""
         first = np.full(len(piece.moves) + 1, len(encoded.row), np.int64)
         planned = encoded.row_start_s
         place = np.searchsorted(encoded.start_s, planned - 1e-6)
@@ -214,8 +214,8 @@ class StreamWriter:
         rest = encoded.row >= 0
         rows, places = encoded.row[rest], np.flatnonzero(rest)
         first[rows] = places
-        # An event never moves past a rest, not even one that takes no time or lies after a stretch
-        # of which nothing was written, or back after one.
+        # An event never moves across a rest, in either direction, not even across one that takes no
+        # time or follows a stretch without written moves.
         first[rows + 1] = np.maximum(first[rows + 1], places + 1)
         first = np.maximum.accumulate(first)
         until = np.full(len(first), len(encoded.row))
@@ -229,7 +229,7 @@ class StreamWriter:
         first = np.concatenate([[0], index[changes]])
         states = [piece.modal_before]
         states += [piece.modal[int(m)] for m in piece.events.modal_id[changes]]
-        # Of several changes at one place the last one counts.
+        # Of several changes at one move the last one counts.
         last = np.append(first[1:] != first[:-1], True)
         ours = [
             replace(state, absolute_xyz=True, absolute_e=False)
@@ -265,7 +265,7 @@ class StreamWriter:
         return buffer[:size].tobytes(), line_end, extruded
 
     def _event(self, piece: Piece, k: int, kind: int, extruded_mm: float) -> bytes:
-        """Text of event k of a piece; `extruded_mm` is where the extruder stands as written."""
+        """Return the text of event k of a piece; `extruded_mm` is the extruder as written."""
         events = piece.events
         line = piece.line(events, k)
         if kind == EventKind.LIMITS:
@@ -275,7 +275,7 @@ class StreamWriter:
         state = piece.modal[int(events.modal_id[k])]
         code = line.split(b";", 1)[0].upper()
         if self._lines.is_move(code):
-            # It goes where the plan is, and the command is somewhere else; a bare F is harmless.
+            # It would move to the plan, but the command is elsewhere; a bare F is harmless.
             return _held_back(line) if re.search(rb"[XYZEIJK]", code) else line
         if SET_POSITION.match(code):
             row = min(int(events.move_index[k]), len(piece.moves) - 1)
@@ -300,7 +300,7 @@ class StreamWriter:
         lead = self._limits_to(self._stream_commands.in_stream(own))
         lead += self._file_modes(state)
         moves_on = self._lines.is_move(code)
-        # Not G10 and G11, whatever words they have: what E reads does not see them.
+        # Not G10 and G11, whatever words they have: they do not change E.
         ends = self._lines.extruder_word(code) if state.absolute_e and moves_on else None
         if ends is not None:
             fed = (float(moves.end_mm[row, 3]) - extruded_mm) / state.extrude_factor
@@ -324,7 +324,7 @@ class StreamWriter:
         return b"".join(line for line in lines if line not in known.splitlines(keepends=True))
 
     def _ours(self, limits: Limits, ours: ModalState) -> bytes:
-        """Lines after which ours run under the stream's limits and in their modes."""
+        """Return lines that set the stream's limits and modes."""
         text = self._limits_to(limits) + self._file_modes(ours)
         self._modal = ours
         if self._far_mm is not None:
@@ -339,7 +339,7 @@ class StreamWriter:
         self._far_mm = extruder_mm if far else None
 
     def _set_again(self, line: bytes, ahead_mm: float) -> bytes:
-        """Line after a G92 E: the extruder is `ahead_mm` further than the plan, and says so.
+        """Return the line after a G92 E that accounts for a lead of the extruder over the plan.
 
         The file counts from there whenever its E is absolute, which may be much later.
         """
@@ -352,14 +352,14 @@ class StreamWriter:
         return b"" if abs(ahead_mm) < _LEAST_GAP_MM else f"G92 E{reads_mm:.7f}\n".encode()
 
     def _file_extruder(self, file_mm: float) -> bytes:
-        """Line after which the printer's E equals the file's."""
+        """Return the line that sets the printer's E to the file's."""
         if self._zero_mm == 0.0:
             return b""
         self._zero_mm = 0.0
         return f"G92 E{file_mm:.7f}\n".encode()
 
     def _file_modes(self, state: ModalState) -> bytes:
-        """Lines that make the printer read as the file expects (not the feedrate)."""
+        """Return lines that restore the file's modes (except the feedrate)."""
         assert self._modal is not None
         now = self._modal
         if (now.absolute_xyz, now.absolute_e) == (state.absolute_xyz, state.absolute_e):
@@ -376,7 +376,7 @@ class StreamWriter:
         return text
 
     def _on(self, piece: Piece, limits: Limits) -> bytes:
-        """Lines before the first segment of a piece."""
+        """Return the lines before the first segment of a piece."""
         parts: list[bytes] = []
         if not self._at_rest:
             parts.append(self._stream_commands.stand_still)
@@ -393,7 +393,7 @@ class StreamWriter:
         return b"".join(parts)
 
     def _off(self, verbatim: VerbatimPart, extruder_mm: float) -> bytes:
-        """Lines that give the printer back to the file."""
+        """Return lines that restore the file's state."""
         shaper = self._shaper_before(verbatim)
         if not self._streaming:
             return self._unmarked() + shaper
@@ -408,14 +408,14 @@ class StreamWriter:
         return text + shaper
 
     def _unmarked(self) -> bytes:
-        """Lines that take the mark of a stream away, once the shaper is on again."""
+        """Return lines that remove the mark of a stream once the shaper is on again."""
         if self._marked is None or self._shaper_off:
             return b""
         limits, self._marked = self._marked, None
         return self._stream_commands.limits(limits)
 
     def _rests(self, verbatim: VerbatimPart, row: int) -> bool:
-        """Whether the machine stands still by itself before and after a move."""
+        """Return whether the machine stands still anyway before and after a move."""
         moves, events = verbatim.moves, verbatim.events
         rests = stops(events)
         if len(moves) == 0:
@@ -448,11 +448,11 @@ class StreamWriter:
         """Set the firmware's shaper again before lines that print on their own.
 
         Firmwares stand still for it. Travel between two streams, as after an object mark, is not
-        worth that: the next stream takes care of its vibration. Nor is what somebody chose to leave
-        out, but its filament is the slicer's, and needs the firmware's pressure advance.
+        worth that: the next stream compensates its vibration. Nor are sections left out on request,
+        but their filament is the slicer's and needs the firmware's pressure advance.
         """
         prints = bool(np.any(verbatim.moves.prints))
-        # A line that sets a part of the shaper finds the other parts as they were.
+        # A line that sets part of the shaper must find the other parts unchanged.
         foreign = bool(np.any(np.isin(verbatim.events.kind, _SHAPED)))
         aside = isinstance(verbatim, LeftOut)  # between streams again and again
         if (prints and not aside) or foreign:

@@ -1,1 +1,1 @@
-"""Information of slicers beside the commands: marks, their own estimates, settings."""
+"""What slicers write besides commands: marks, estimates, settings."""

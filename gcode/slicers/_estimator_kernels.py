@@ -1,4 +1,4 @@
-"""The queue of an estimator: entry speeds by look-ahead over a limited number of blocks."""
+"""Kernels of an estimator's queue: entry speeds by look-ahead over a limited number of blocks."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _DISTANCE, _ACCEL, _CRUISE, _SAFE, _MOST, _ENTRY, _FREE, _CHANGED, _TIME = range
 
 @kernel
 def trapezoid_s(entry: float, cruise: float, leave: float, accel: float, distance: float) -> float:
-    """Time of a block; one that is too short for its leaving speed just gets as far as it can."""
+    """Return the time of a block; if too short, it does not reach its exit speed."""
     up = max(0.0, (cruise * cruise - entry * entry) / (2.0 * accel))
     down = max(0.0, (cruise * cruise - leave * leave) / (2.0 * accel))
     level = distance - up - down

@@ -1,9 +1,9 @@
-"""The time that a slicer of the PrusaSlicer family estimates for a file, by its own rules.
+"""Reproduce the print time that a slicer of the PrusaSlicer family estimates for a file.
 
 The estimator plans much as Marlin with classic jerk does, and differs in details that add up to per
 cents: the queue is longer, whole passes go over it, G28 is a move to 0, an axis's limit of
-acceleration has a form of its own. A file whose slicer's limits stand in it is planned here as the
-slicer did: the interpreter of lines and the planners are held against it.
+acceleration has its own form. A file that contains its slicer's limits is planned here as the
+slicer did, as a check of the interpreter and the planners.
 
 Source: `GCodeProcessor.cpp` of PrusaSlicer 2.4 (queue forward, then back; an axis's acceleration
 limit taken as the block's) and 2.9 (back, then forward; scaled to the axis), OrcaSlicer 2.3, and
@@ -192,7 +192,7 @@ def _junctions(
 
 
 def _turn_radius(before: NDArray[np.float64], rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Radius of the circle that a slight turn of the path lies on; endless for others."""
+    """Return the radius of the circle of a slight turn of the path; infinite for others."""
     now = rows[:, _ENTER]
     norms = np.hypot(*before[:, :2].T) * np.hypot(*now[:, :2].T)
     dot = np.clip(np.sum(before[:, :2] * now[:, :2], axis=1) / np.maximum(norms, 1e-12), -1.0, 1.0)

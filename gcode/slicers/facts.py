@@ -23,7 +23,7 @@ __all__ = ["LOOKED_AT_BYTES", "SlicerFacts", "facts_in", "read_facts"]
 
 LOOKED_AT_BYTES = 1 << 20
 _PLACEHOLDER_S = 6666.0
-"""What CuraEngine writes before anybody knows the time."""
+"""CuraEngine's placeholder while the time is unknown."""
 
 _IDENTITIES = tuple(
     re.compile(pattern, re.MULTILINE)
@@ -41,8 +41,8 @@ _BLOCKS = (
     (re.compile(rb"^; prusaslicer_config = begin[ \t\r]*$", re.M), b"\n; prusaslicer_config = end"),
     (re.compile(rb"^; CONFIG_BLOCK_START[ \t\r]*$", re.M), b"\n; CONFIG_BLOCK_END"),
 )
-"""How blocks of settings begin and end: to be looked for one after the other, as a pattern of both
-takes the square of the time where many begin and none ends."""
+"""Beginning and end of blocks of settings, searched separately: a combined pattern would take
+quadratic time if many begin and none ends."""
 _COMMENT = re.compile(rb"\n;[^\n]*")
 _SETTING = re.compile(rb"^; ([a-z][a-z0-9_]*) = ?([^\r\n]*)", re.MULTILINE)
 _CURA_SETTING = re.compile(rb"^;SETTING_3 ([^\r\n]*)", re.MULTILINE)
@@ -129,7 +129,7 @@ def read_facts(file: BinaryIO) -> SlicerFacts:
 def facts_in(head: bytes, tail: bytes = b"") -> SlicerFacts:
     """Return the facts in the two ends of a text."""
     estimate_s = _estimate_s(head, tail)
-    # Nearly all of it are moves, which no pattern below looks at.
+    # Moves are most of the text, and no pattern below matches them.
     head, tail = _comments(head), _comments(tail)
     slicer, version = _identity(head)
     settings = _settings(head, tail)
@@ -170,7 +170,7 @@ def _estimate_s(head: bytes, tail: bytes) -> float | None:
 
 
 def _time_lines(text: bytes) -> Iterator[re.Match[bytes]]:
-    """Find the lines that may tell times by their word: a search for patterns reads all others."""
+    """Find lines that may state times by their keyword, which is faster than a pattern search."""
     starts = set()
     for word in (b"IME", b"ime"):
         at = text.find(word)
@@ -216,7 +216,7 @@ def _cura_settings(head: bytes, tail: bytes) -> dict[str, str]:
     for text in reversed(texts):  # the global ones win
         reader = configparser.RawConfigParser(strict=False, allow_no_value=True)
         try:
-            # The reader takes the square of the time over long gaps.
+            # The parser takes quadratic time over long gaps.
             reader.read_string(_GAP.sub(" ", str(text)))
         except configparser.Error:
             continue

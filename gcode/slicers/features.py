@@ -1,4 +1,4 @@
-"""One vocabulary for the kinds of extruded lines, whatever slicer wrote them.
+"""A common vocabulary for the kinds of extruded lines of all slicers.
 
 Source: `ExtrusionRole.cpp` of PrusaSlicer 2.9 and SuperSlicer 2.5, `ExtrusionEntity.cpp` of
 OrcaSlicer 2.3 and BambuStudio 2.3; the output of Cura 5, ideaMaker, KISSlicer 2, Simplify3D and

@@ -66,7 +66,7 @@ _PATTERNS: tuple[tuple[re.Pattern[str], MarkKind], ...] = tuple(
     (re.compile(pattern), kind)
     for pattern, kind in (
         (r"; ?stillpath\b|; Processed by stillpath ", MarkKind.STAMP),
-        # Typed by people: one that is missed lets moves be changed that shall not be.
+        # Typed by users, so read leniently: a missed one would let protected moves be changed.
         (r";\s*(?i:stillpath_off)\b", MarkKind.OFF),
         (r";\s*(?i:stillpath_on)\b", MarkKind.ON),
         (r";LAYER_CHANGE\s*$", MarkKind.LAYER),  # PrusaSlicer, SuperSlicer, Orca, Creality

@@ -1,8 +1,8 @@
 """Update the times that the slicer wrote into the file to those of the new motion.
 
-The slicer counts what we do not plan (heating, homing, changes of filament), and its planner is its
-own. So its times stay, and only what the motion of the written file takes longer is added: at every
-place the delay that has come up so far. A shift of the last second changes no line.
+The slicer counts what we do not plan (heating, homing, changes of filament) and has its own
+planner. Its times are therefore kept, and only the additional time of the written motion is added:
+at every place the delay accumulated so far. A shift of the last second changes no line.
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ _COMMAND = re.compile(rb"^[ \t\r\f\v]*(?:[^\s;]|; stillpath)[^\n]*\n?", re.MULTI
 _LOOKED_THROUGH_BYTES = 1 << 16
 _STOPS = (MarkKind.COLOR_CHANGE, MarkKind.PAUSE)
 _BEGINS, _TELLS = (np.isin(np.arange(256), list(found)) for found in (b";M \t", b"TPRemCE-"))
-"""Bytes with which a line that tells times may begin, and the first one after its semicolon."""
+"""Possible first bytes of a line that states times, and those after its semicolon."""
 
 
 class Retiming:
-    """Take note of a text while it is written, then copy it with new times.
+    """Records a text while it is written, then copies it with new times.
 
-    A line that tells times is kept as three numbers, and read again when the text is copied.
+    A line that states times is stored as three numbers, and read again when the text is copied.
 
     Parameters
     ----------
     head, tail : bytes
-        Lines of ours to stand before the first command and after the last one. The comments
-        around stay at the very ends of the file: slicers and hosts know it by them.
+        Lines of ours to insert before the first command and after the last one. The comments around
+        stay at the very ends of the file, where slicers and hosts look for them.
     keep_times : bool
         Change no time.
     """
@@ -221,7 +221,7 @@ def retimed(text: bytes, delay_s: float) -> bytes:
 
 
 def _total(told_s: Mapping[tuple[TimeKind, bool], float], *, silent: bool) -> float:
-    """Return how long the slicer thinks the print takes; 0 where it says nothing."""
+    """Return the slicer's estimate of the print time; 0 if there is none."""
     for wanted in (TimeKind.TOTAL, TimeKind.ELAPSED, TimeKind.REMAINING):
         if (wanted, silent) in told_s:
             return told_s[wanted, silent]
@@ -230,7 +230,7 @@ def _total(told_s: Mapping[tuple[TimeKind, bool], float], *, silent: bool) -> fl
 
 @lru_cache(maxsize=256)
 def _what_it_tells(line: bytes) -> Literal["time", "stop"] | None:
-    """Whether a line tells times or marks a stop; slicers repeat theirs thousands of times."""
+    """Return whether a line states times or marks a stop; cached, as slicers repeat lines."""
     if may_tell_time(line) and read_times(line):
         return "time"
     mark = read_mark(line.decode("latin-1")) if line[:1] == b";" else None
@@ -255,10 +255,10 @@ def _candidates(item: VerbatimPart) -> NDArray[np.int64]:
 
 
 def behind_last_command(text: bytes) -> int:
-    """Return where the last line ends that is no comment of others; 0 if there is none."""
+    """Return the end of the last line that is not a comment of others; 0 if there is none."""
     end, width = len(text), 128
     while end > 0:
-        # Most often it is one of the last lines; thumbnails and settings have thousands.
+        # It is usually near the end, but thumbnails and settings may have thousands of lines.
         start = text.rfind(b"\n", 0, max(end - width, 0)) + 1
         ends = [line.end() for line in _COMMAND.finditer(text, start, end)]
         if ends:

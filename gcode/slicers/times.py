@@ -113,7 +113,7 @@ _LONGEST = 200
 
 
 def may_tell_time(line: bytes) -> bool:
-    """Return cheaply whether `read_times` is worth a look at the line."""
+    """Return, at low cost, whether a line may contain times for `read_times`."""
     if line.startswith(b"M73"):
         return True
     if not line.startswith(b";"):
@@ -172,7 +172,7 @@ def _rounded(value: float, like: bytes) -> bytes:
 
 
 def _spelled(seconds: float, like: bytes) -> bytes:
-    """Write a duration as slicers do: from the largest unit that counts to that of another."""
+    """Format a duration like another one: from the largest nonzero unit to its smallest."""
     parts = _PARTS.findall(like)
     last, smallest = parts[-1]
     gap = b" " if b" " in like or len(parts) == 1 else b""

@@ -1,4 +1,4 @@
-"""Finds Klipper's resonance test in an accelerometer log, and the direction of the sensor.
+"""Find Klipper's resonance test in an accelerometer log, and the direction of the sensor.
 
 The regenerated command is a chirp, so its cross-correlation with the log has one sharp peak. The
 correlation is a vector (one component per sensor axis): its norm finds the start whichever way
@@ -27,7 +27,7 @@ _LEAST_CORRELATION = 0.6
 _SECOND_PEAK = 0.8
 _APART_S = 2.0  # beyond the side lobes of one peak
 _LEAST_FRACTION = 0.95  # of the sweep, before a cut log is refused
-_LATEST_START_S = 0.6  # half a second, and what else is late: sensor, plant, time stamps
+_LATEST_START_S = 0.6  # half a second, plus delays of sensor, plant and time stamps
 _LEAD_S = 0.5
 _CROSS = 0.2  # of the power along the axis
 _LEAST_COSINE = 0.7  # 45 degrees: nearer to this axis than to another
@@ -306,7 +306,7 @@ def _coupling(
 def _not_found(
     log: AccelerationLog, excitation: Excitation, accel: Array, correlation: float
 ) -> str:
-    """Say why nothing correlates: an axis is dead, nothing moved, or something else did."""
+    """Return why nothing correlates: a dead axis, no motion, or other motion."""
     dead = [name for name, v in zip("xyz", log.accel_mm_s2.T, strict=True) if np.ptp(v) == 0.0]
     if dead:
         return (

@@ -1,4 +1,4 @@
-"""Averages repeats into one measurement."""
+"""Average repeats into one measurement."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ _FLAT = 0.2
 def mean_response(responses: Sequence[FrequencyResponse]) -> FrequencyResponse:
     """Return the mean weighted by 1/sd^2, on the frequencies that all share.
 
-    Delays that differ (each recording starts at its own instant) are made those of the first.
-    Its standard deviation is the larger of what the members' own say and of their scatter.
+    Differing delays (each recording starts at its own instant) are matched to the first. The
+    standard deviation is the larger of that of the members and that of their scatter.
 
     Raises
     ------
@@ -104,8 +104,8 @@ def mean_spectrum(spectra: Sequence[Spectrum]) -> Spectrum:
 def aligned_to(response: FrequencyResponse, reference: FrequencyResponse) -> FrequencyResponse:
     """Return the response with the delay of the reference.
 
-    The delay that makes both most alike over all coherent frequencies: at low frequency alone
-    noise would tell too little.
+    The delay maximises the agreement over all coherent frequencies: low frequencies alone would be
+    too noisy.
     """
     used = ~(response.coherence < _COHERENT)
     low, high = reference.f_hz[0], reference.f_hz[-1]
@@ -128,7 +128,7 @@ def aligned_to(response: FrequencyResponse, reference: FrequencyResponse) -> Fre
 
 
 def low_frequency_delay(f_hz: Array, response: ComplexArray) -> float:
-    """Return the delay [s] that the phase's slope shows where the modulus is still flat.
+    """Return the delay [s] from the slope of the phase where the modulus is still flat.
 
     There the modes add little, each only 2 zeta/w.
     """

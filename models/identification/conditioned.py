@@ -1,4 +1,4 @@
-"""Changes of an axis with weight on the bed or with position, from runs under such conditions."""
+"""Derive schedules over bed load and position from runs under such conditions."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def _mass(nominal: Fit, loaded: Mapping[Condition, Fit]) -> tuple[MassSchedule, 
 
 
 def _moved(before: Sequence[ModeEstimate], after: Sequence[ModeEstimate]) -> tuple[int, int]:
-    """Return which mode moved, in both lists: without it the others agree best.
+    """Return the index, in both lists, of the mode that moved: the others then agree best.
 
     Both rise in frequency, so a mode that falls below its neighbour changes its place.
     """

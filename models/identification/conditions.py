@@ -16,7 +16,7 @@ _PLACE = re.compile(r"([xyz])=(-?\d+(?:\.\d+)?)")
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """What was different from the usual.
+    """How the conditions of a measurement differ from the nominal ones.
 
     Attributes
     ----------

@@ -46,7 +46,7 @@ _STEP_HZ = 0.25
 _TAPER = 0.01
 _PLATEAU_HZ = (8.0, 15.0)
 _PLATEAU_TOLERANCE = 0.22
-"""Sensors read up to 15 % wrong, and a frame on its feet makes some per cent more of it."""
+"""Sensors are up to 15 % off, and a frame on its feet adds some per cent."""
 _NOT_MOVING = 0.3
 _LEAST_COHERENCE = 0.95
 _LEAST_FOLLOWED = 0.15
@@ -108,7 +108,7 @@ def estimate_aligned(
         )
     f_hz = np.arange(np.ceil(first / _STEP_HZ), np.floor(last / _STEP_HZ) + 1) * _STEP_HZ
     found = response_at(aligned, f_hz)
-    # The command is known as averages over samples, the sensor samples points.
+    # The command is known as averages over sampling intervals, the sensor's data as points.
     undone = np.sinc(f_hz / aligned.rate_hz)
     notes = (*log.notes, *aligned.notes)
     return FrequencyResponse(
@@ -144,7 +144,7 @@ def plateau_gain(response: FrequencyResponse) -> float | None:
         return None
     squared, magnitude = response.f_hz[used] ** 2, np.abs(response.response[used])
     slope, inverse_gain = np.polyfit(squared, 1.0 / magnitude, 1)
-    # A plant that falls is no resonance far above: its own level says more than a line.
+    # A falling response has no resonance above: use its level instead of the line.
     return float(1.0 / inverse_gain) if slope < 0 else float(np.median(magnitude))
 
 
@@ -159,7 +159,7 @@ def check_plateau(response: FrequencyResponse, excitation: Excitation) -> None:
     if gain is None or abs(gain - 1.0) <= _PLATEAU_TOLERANCE:
         return
     if gain >= _NOT_MOVING:
-        # A frame that shakes within the plateau bends it.
+        # A frame resonance within the plateau distorts it.
         frame = frame_of(response)
         if frame is not None and abs(frame.level - 1.0) <= _PLATEAU_TOLERANCE:
             return
@@ -202,7 +202,7 @@ def estimate_driven(
     records = []
     transient = not all(_rests(log.command) for log in logs)
     for log in logs:
-        # Gravity and offsets of sensors are no response.
+        # Remove gravity and sensor offsets.
         command, measured = (
             v - np.mean(v if transient else _ends(v)) for v in (log.command, log.measured)
         )

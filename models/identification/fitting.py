@@ -1,8 +1,8 @@
 """Fits a plant to a measured frequency response.
 
-Sanathanan-Koerner over a range of delays gives starts, nonlinear least squares on pairs of poles
-and zeros polishes them; the number of pairs rises while the residual falls clearly and is not yet
-explained by the noise.
+Sanathanan-Koerner over a range of delays gives starting points, which nonlinear least squares on
+pairs of poles and zeros refines; the number of pairs rises while the residual falls clearly and is
+not yet explained by the noise.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ _ZEROS_BAND = (0.5, 10.0)
 _ZETA = (3e-3, 3.0)
 _TINY = 1e-9
 _FAR_ZERO = 3.0
-"""A real zero above this multiple of the band is hardly anything but a delay."""
+"""A real zero above this multiple of the band can hardly be told from a delay."""
 
 
 def fit_response(
@@ -89,7 +89,7 @@ def fit_response(
     band_hz : (low, high), optional
         Use only these frequencies.
     progress : callable, optional
-        Told the share done, 0 to 1.
+        Receives the share done, 0 to 1.
 
     Returns
     -------
@@ -182,7 +182,7 @@ def _mirrored(data: ResponseData, fit: _Candidate, sides: Array) -> _Candidate:
     vector = fit.vector.copy()
     turned = (sides > 0) & (fit.theta < 0)
     vector[2:][turned] *= -1
-    # What a zero no longer delays, the delay takes over: of a pair 4 zeta/w, of a real one 2 tau.
+    # The delay replaces that of a mirrored zero: 4 zeta/w for a pair, 2 tau for a real one.
     vector[1] += 2 * float(np.sum(_zero_delay(fit)[turned]))
     return _polished(data, replace(fit, vector=vector), sides)
 
@@ -217,7 +217,7 @@ def _zero_hz(fit: _Candidate) -> Array:
 
 
 def _by_the_knee(tried: list[_Candidate], noise: float) -> _Candidate:
-    """Return the smallest order that no larger one betters clearly."""
+    """Return the smallest order on which no larger one improves clearly."""
     chosen = tried[0]
     for larger in tried[1:]:
         pairs = larger.structure.poles - chosen.structure.poles

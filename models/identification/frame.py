@@ -1,4 +1,4 @@
-"""The frame on its feet, which a sensor feels and a nozzle over its bed does not.
+"""Find and remove the mode of the frame on its feet, which does not move nozzle against bed.
 
 An accelerometer measures against the ground. A frame that shakes by reaction (mass ratio mu,
 frequency w) multiplies what the nozzle does over the bed by 1 - mu s^2/(s^2 + 2 z w s + w^2), to
@@ -22,8 +22,8 @@ P = TypeVar("P", bound=PlantSpec)
 _HIGHEST_HZ, _BELOW, _SHARE = 30.0, 0.7, 0.25
 """A frame's mode is at most this high, this ratio to the strongest mode, and this large a share."""
 LIKELY = 0.8
-"""Probability that a weak mode far below the strongest is the frame's. A response shows the mode,
-not whose it is. Taking the frame's for the nozzle's costs more than the reverse (docs/tried.md)."""
+"""Probability that a weak mode far below the strongest is the frame's; a response cannot show it.
+Mistaking the frame's for the nozzle's costs more than the reverse (docs/tried.md)."""
 _UNLIKE, _UNLIKE_LIKELY = 1.4, 0.3
 """A frame stands on the same feet in X and in Y, and its frequencies there are alike: within 1.3
 times in spectra of virtual printers. Modes further apart are not of one frame, and rather something
@@ -33,13 +33,13 @@ _BESIDE = 0.25
 
 
 def shaken(crowd: Sequence[P], rng: np.random.Generator, likely: float) -> list[P]:
-    """Take the frame out of a share `likely` of plants, as the nozzle over the bed feels none."""
+    """Remove the frame's mode from a share `likely` of plants."""
     frame = rng.random(len(crowd)) < likely
     return [without_frame(p) if shakes else p for p, shakes in zip(crowd, frame, strict=True)]
 
 
 def frame_hz_of(crowd: Sequence[PlantSpec]) -> float | None:
-    """Return where most plants have a weak mode that may be the frame's, if they do."""
+    """Return the frequency of a weak mode of most plants that may be the frame's; else None."""
     lowest = [
         min(mode.f_hz for mode in plant.modes)
         for plant in crowd
@@ -49,7 +49,7 @@ def frame_hz_of(crowd: Sequence[PlantSpec]) -> float | None:
 
 
 def likely_of(frames_hz: Iterable[float | None]) -> float:
-    """Return how likely such modes are the frame's, from where each axis has one."""
+    """Return the probability that such modes are the frame's, given their frequencies by axis."""
     seen = [f_hz for f_hz in frames_hz if f_hz is not None]
     return LIKELY if not seen or max(seen) < _UNLIKE * min(seen) else _UNLIKE_LIKELY
 

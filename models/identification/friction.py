@@ -1,11 +1,11 @@
 """Dry friction in logs of Klipper's test, and responses corrected for it.
 
-Where the motion turns, friction turns over, and the axis receives less than its command by 2 c
-(`models.friction`): a drive of its own, known but for its size. It has harmonics, and turns where
-slow and quick motion together do, so no response of the axis explains it; the size is the one with
-which responses leave least of the logs. Below the resonance, as further up the instants at which
-the motion turns are too uncertain. The same friction makes responses of the fundamental look damped
-and stiff; those to the command less what was held back are not.
+Where the motion reverses, friction reverses too, and the axis receives 2 c less than its command
+(`models.friction`): an additional input, known up to its size. It has harmonics, and depends on
+slow and fast motion together, so no linear response explains it; the size is the one with the
+smallest residual of the logs. Only the band below the resonance is used, as the instants of
+reversal are too uncertain above it. Friction makes responses of the fundamental look damped and
+stiff; responses to the corrected command do not.
 """
 
 from __future__ import annotations
@@ -35,27 +35,27 @@ _LEAST_HZ = 4.0
 _CLEARLY = 0.01
 """Logarithm of the ratio of residuals with friction and without."""
 _APART = 0.5
-"""Repeats differ by at most so much of their mean, or it was something else."""
+"""Largest spread of repeats relative to their mean; beyond it, the cause is not friction."""
 
 
 def dry_friction(
     logs: Sequence[AlignedLog], motions: Sequence[Sequence[FrequencyResponse]]
 ) -> tuple[float, int]:
-    """Return how far dry friction holds an axis back, from repeats, and by which of its motions.
+    """Return the size of dry friction from repeats, and the motion that explains it best.
 
     Parameters
     ----------
     logs : sequence of AlignedLog
         Repeats.
     motions : sequence of sequence of FrequencyResponse
-        What may slide: each a response per log (as felt; over a frame that shakes).
+        Candidate sliding motions: each a response per log (as measured; relative to the frame).
 
     Returns
     -------
     held_mm : float
         0 where no friction is clear.
     motion : int
-        That with which the logs are explained best.
+        Index of the motion that explains the logs best.
     """
     every = [[_left(log, one) for log, one in zip(logs, way, strict=True)] for way in motions]
     rows = [np.stack(way) for way in every if way and all(len(row) for row in way)]
@@ -71,13 +71,13 @@ def dry_friction(
 
 
 def freed(aligned: AlignedLog, response: FrequencyResponse, size_mm: float) -> AlignedLog:
-    """Return the log with a command less what friction held back."""
+    """Return the log with the command corrected for friction."""
     held = size_mm * _bend_rate(aligned, response)
     return replace(aligned, command_mm_s2=aligned.command_mm_s2 - held)
 
 
 def _left(aligned: AlignedLog, response: FrequencyResponse) -> Array:
-    """Return the mean logarithm of what responses leave, by size of friction."""
+    """Return the mean log residual of responses, by size of friction."""
     top_hz = min(_HIGHEST_HZ, _BELOW * float(response.f_hz[np.argmax(np.abs(response.response))]))
     f_hz = np.arange(float(response.f_hz[0]), top_hz, _STEP_HZ)
     if top_hz - float(response.f_hz[0]) < _LEAST_HZ:
@@ -92,7 +92,7 @@ def _left(aligned: AlignedLog, response: FrequencyResponse) -> Array:
 
 
 def _lowest(left: Array) -> float:
-    """Return where a parabola through the lowest value and its neighbours is lowest."""
+    """Return the minimum of a parabola through the lowest value and its neighbours."""
     i = int(np.clip(np.argmin(left), 1, len(left) - 2))
     near = slice(i - 1, i + 2)
     bend, slope, _ = np.polyfit(_SIZES_MM[near], left[near], 2)
@@ -108,7 +108,7 @@ def _bend_rate(aligned: AlignedLog, response: FrequencyResponse) -> Array:
     size = next_fast_len(2 * len(accel), real=True)
     f_hz = rfftfreq(size, step_s)
     s_squared = -((2 * np.pi * np.maximum(f_hz, f_hz[1])) ** 2)
-    # Slow motion is followed; how the axis differs from that is short and has no drift.
+    # Slow motion is followed exactly; the deviation from it is short and has no drift.
     extra = irfft(_extra(response, f_hz) / s_squared * rfft(accel, size), size)[: len(accel)]
     bend = bend_of(way + extra)
     return np.pad(np.diff(bend, 2), 1) / step_s**2

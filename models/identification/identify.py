@@ -160,7 +160,7 @@ class _Steps:
 
 
 class _AxisWork:
-    """One axis on its way from measurements to plants."""
+    """The identification of one axis."""
 
     def __init__(
         self,
@@ -188,7 +188,7 @@ class _AxisWork:
         )
 
     def frame_hz(self) -> float | None:
-        """Return where a weak mode may be the frame's: of spectra, where nothing else tells."""
+        """Return the frequency of a weak mode in spectra that may be the frame's; else None."""
         if self._kind != "spectrum":
             return None
         self._spectra = [self._spectrum(one) for one in self._used]
@@ -209,7 +209,7 @@ class _AxisWork:
         Parameters
         ----------
         frame_likely : float
-            That a weak mode in spectra is the frame's.
+            Probability that a weak mode in spectra is the frame's.
         """
         if self._kind == "model file":
             found = self._from_model()
@@ -362,9 +362,9 @@ class _AxisWork:
         common: Collection[Condition],
         frame: Frame | None,
     ) -> tuple[list[tuple[FrequencyResponse, Condition]], float]:
-        """Return responses without what dry friction did, and how far it holds the axis back.
+        """Return responses corrected for dry friction, and its size.
 
-        Guides feel motion over the frame, a sensor what the frame does as well.
+        Guides slide relative to the frame, but a sensor also measures the frame's motion.
         """
         used = [k for k, (_, c) in enumerate(responses) if c in common]
         felt = [r for r, _ in responses]
@@ -386,7 +386,7 @@ class _AxisWork:
         motion: FrequencyResponse,
         friction_mm: float,
     ) -> FrequencyResponse:
-        """Return the response of a log without what dry friction did to a motion over the frame."""
+        """Return the response of a log corrected for dry friction of a motion over the frame."""
         log = self._used[number].measurement
         assert isinstance(log, AccelerationLog)
         aligned = freed(self._aligned[number], motion, friction_mm)

@@ -1,4 +1,4 @@
-"""What a solver asks for twice at one point, residual and Jacobian, is computed once."""
+"""Cache a function's last value, for solvers that need residual and Jacobian at one point."""
 
 from __future__ import annotations
 

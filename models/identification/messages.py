@@ -55,7 +55,7 @@ def by_file(told: Iterable[tuple[str, str]]) -> list[str]:
 
 
 def mounting_notes(axis: str, responses: Sequence[FrequencyResponse]) -> list[str]:
-    """Say how the sensor sits, where its axes are not the machine's: many are mounted so."""
+    """Return notes on a sensor whose axes are not the machine's, as is common."""
     notes = []
     for response in responses:
         along = dict(zip("xyz", map(abs, response.sensor_direction or ()), strict=False))
@@ -71,7 +71,7 @@ def mounting_notes(axis: str, responses: Sequence[FrequencyResponse]) -> list[st
 
 
 def body_notes(friction_mm: float, frame: Frame | None) -> list[str]:
-    """Say what else than the axis was seen."""
+    """Return notes on other effects that were found: friction and frame."""
     notes = []
     if friction_mm:
         notes.append(
@@ -119,7 +119,7 @@ def parted(told: Iterable[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 
 def fit_warnings(fit: Fit, sources: Sequence[str]) -> tuple[str, ...]:
-    """Tell of a model that should not be relied on; refuse one that is none."""
+    """Return warnings about an unreliable model; refuse a useless one."""
     if fit.magnitude_only:
         limits, missed = (_POOR_DB, _USELESS_DB), f"{fit.residual:.1f} dB"
     else:
@@ -154,7 +154,7 @@ def level_warnings(responses: Sequence[FrequencyResponse], fit: Fit) -> list[str
 
 
 def scale_warnings(responses: Sequence[FrequencyResponse], fit: Fit) -> list[str]:
-    """Tell of a command and a measurement that are hardly those of one axis in one unit."""
+    """Warn if command and measurement seem to differ in axis or unit."""
     names, warnings = ", ".join(dict.fromkeys(r.source for r in responses)), []
     if abs(fit.gain - 1.0) > _LEVEL_TOLERANCE:
         warnings.append(
@@ -172,7 +172,7 @@ def scale_warnings(responses: Sequence[FrequencyResponse], fit: Fit) -> list[str
 
 
 def _slope_text(response: FrequencyResponse) -> str:
-    """Tell of a response that rises or falls like a power of f over its lowest octave."""
+    """Describe a response that follows a power of f over its lowest octave."""
     f_hz = response.f_hz
     known = (f_hz > 0) & (np.abs(response.response) > 0) & ~(response.coherence < _LEAST_COHERENCE)
     if np.count_nonzero(known) < _LEAST_POINTS:

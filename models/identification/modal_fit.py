@@ -1,9 +1,9 @@
-"""Fits modes, with a delay as small as guides cause it, to a measured frequency response.
+"""Fit modes, with a delay no larger than guides cause, to a measured frequency response.
 
-Pairs of poles and zeros (`fitting`) explain any response, but what they delay slow motion by trades
-off with the start of the recording, and nothing keeps it small. Where modes on relative speed
-(`modal_structure`) explain as much, they are taken: of their damping some may act against the
-frame, so that slow motion is late by d/k at most.
+Pairs of poles and zeros (`fitting`) explain any response, but their delay of slow motion trades off
+with the start of the recording, and is unbounded. Where modes damped by relative speed
+(`modal_structure`) explain as much, they are used: part of their damping may act against the frame,
+so that slow motion is delayed by at most d/k.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ def alternatives(measured: FrequencyResponse, fit: Fit) -> tuple[Fit, ...]:
 
 
 def _all_ring(fit: Modal) -> bool:
-    """Return whether every mode does something that a measurement can show."""
+    """Return whether every mode has a measurable effect."""
     _, zeta, share = fit.structure.split(fit.theta)
     return bool(np.all((np.abs(share) > _LEAST_PEAK * 2 * zeta) & (np.abs(share) > _LEAST_SHARE)))
 
@@ -218,7 +218,7 @@ def _least_damping(data: ResponseData, fit: Modal) -> Array:
 
 
 def _calm_damping(data: ResponseData, fit: Modal) -> Array:
-    """Of a mode that was not swept over only the flank shows: it must not ring by chance."""
+    """Return a least damping for modes above the band, of which only the flank was measured."""
     beyond = fit.structure.split(fit.theta)[0] * data.unit_hz > data.f_hz[-1]
     return np.where(beyond, _UNSEEN_ZETA, _ZETA[0])
 

@@ -1,14 +1,14 @@
 """The motion of the nozzle relative to the bed, from what a sensor measures against the ground.
 
-What moves drives the frame on its feet by reaction: the frame's motion is -R times what is felt,
+The moving mass excites the frame on its feet: the frame's motion is -R times the measured one,
 
     R(s) = mu s^2 / (s^2 + 2 z w s + w^2),
 
-mu the mass that moves over that of the frame, w and z of the frame on its feet. With P what the
-axis does on a frame that is held, modes on relative speed (`modal_structure`), the sensor feels
-H = P / (1 + R P), and the nozzle does G = (1 + R) H over the bed. P and R are fitted together, and
-the measured response is multiplied by 1 + R: that neither delays slow motion, nor is it left to
-later fits to tell the frame from a mode.
+mu the ratio of moving to frame mass, w and z those of the frame on its feet. With P the response of
+the axis on a fixed frame, as modes damped by relative speed (`modal_structure`), the sensor
+measures H = P / (1 + R P), and the nozzle moves by G = (1 + R) H over the bed. P and R are fitted
+together, and the measured response is multiplied by 1 + R. This does not delay slow motion, and
+later fits need not tell the frame from a mode.
 """
 
 from __future__ import annotations
@@ -55,11 +55,11 @@ class Frame:
     Attributes
     ----------
     f_hz, zeta : float
-        On its feet, what moves held.
+        Of the frame on its feet, with the axes fixed.
     mass_ratio : float
-        What moves, against the frame.
+        Ratio of the moving mass to the frame's.
     level : float
-        Of what was measured against what was commanded, at rest.
+        Ratio of measured to commanded motion at low frequency.
     """
 
     f_hz: float
@@ -118,7 +118,7 @@ class _Found:
         return Frame(float(f), float(zeta), float(mu), float(np.exp(self.vector[0])))
 
     def on_its_feet(self, f_hz: float) -> _Found:
-        """Return the same with a frame that shakes at this frequency."""
+        """Return the same with a frame resonance at this frequency."""
         frame = [np.log(f_hz), np.log(_START[0]), _START[1]]
         vector = np.concatenate([self.vector[:2], frame, self.vector[2:]])
         return replace(self, vector=vector, shaken=True)

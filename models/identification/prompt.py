@@ -1,4 +1,4 @@
-"""Plants without delay of slow motion, which a recording without a common clock cannot show."""
+"""Remove the delay of slow motion, which a recording without a common clock cannot show."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ _MOST_ZETA = 10.0
 def prompt(fit: Fit) -> PlantSpec:
     """Return the plant of a fit without its delay of slow motion.
 
-    A recording does not tell when it began: of the delay at low frequency, what is the plant's and
-    what the clock's is only a guess of the fit. Phases of resonances relative to slow motion are
-    what was measured, and stay. Where the phase was not measured, as it is.
+    The start of a recording is unknown: the fit can only guess how its delay at low frequency
+    divides between plant and clock. The measured phases of resonances relative to slow motion are
+    kept. A plant without measured phase is returned unchanged.
     """
     return fit.spec if fit.magnitude_only else advanced(fit.spec)
 
 
 def advanced(plant: PlantSpec) -> PlantSpec:
-    """Return the plant with slow motion on time, its resonances as late against it as before."""
+    """Return the plant advanced by its delay of slow motion."""
     if isinstance(plant, RelativeModesSpec) and plant.delay_s != 0.0:
         plant = _as_pairs(plant) or plant.without_delay()
     return plant.without_delay() if isinstance(plant, PairsSpec) else plant
 
 
 def delay_of(plant: PlantSpec) -> float:
-    """Return what slow motion is late by [s]: sum of 1/zero minus sum of 1/pole.
+    """Return the delay of slow motion [s]: sum of 1/zero minus sum of 1/pole.
 
-    Of a discrete plant 0: it is not known what of it the sampling is.
+    0 for a discrete plant, where the part due to sampling is unknown.
     """
     roots = plant.roots()
     if roots.dt_s is not None:

@@ -1,4 +1,4 @@
-"""A dozen plants that represent many: those that differ most in their effect on a command."""
+"""Choose a dozen plants to represent many: those that differ most in effect on a command."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _PATH = _F_HZ**-2.0
 _OUTLIERS = 0.9
 """Share of the crowd, from the middle outwards, among which members are chosen."""
 _APART = 0.5
-"""|G_i - G_j| from which on members do not agree."""
+"""Smallest |G_i - G_j| at which members count as disagreeing."""
 _DEVIATION = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
 
@@ -83,7 +83,7 @@ def mode_spread(population: Population[RelativeModesSpec]) -> tuple[ModeEstimate
 def representatives(centres: Sequence[P], crowd: Sequence[P]) -> Population[P]:
     """Choose members: one in the middle, then, again and again, the one least like those chosen.
 
-    Plants differ by the rms of what they make of a path with corners.
+    The distance of plants is the rms difference of their responses to a path with corners.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
 """Plants that explain a frequency response: fits to random draws from its uncertainty.
 
-The response is perturbed by what it may be wrong by, repeats are weighted anew (Bayesian bootstrap,
-Rubin 1981), and fits with a mode more or less take part where they explain as much. Every plant is
-moved by what an axis itself changes from one run to the next.
+The response is perturbed within its uncertainty, repeats are reweighted (Bayesian bootstrap, Rubin
+1981), and fits with one mode more or less are included where they explain as much. Every plant is
+also varied by the typical change of an axis from run to run.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ _POINTS = 120
 _LEAST_SD = 0.005
 """Relative; no axis is more linear than that."""
 _LOST, _NOTHING = 3.0, 0.9
-"""A fit has failed if its residual exceeds this multiple of the usual one of a draw, or this share
-of the response."""
+"""A fit has failed if its residual exceeds this multiple of a draw's typical one, or this share of
+the response."""
 _RUN_TO_RUN = (0.007, 0.12)
 """Relative standard deviation of frequencies and damping within a session, on real axes."""
 
@@ -66,7 +66,7 @@ def explain_response(
     population : Population
         Slow motion of every plant is on time (`prompt`).
     delay_s : (float, float)
-        What of the delay at low frequency may be the plant's own.
+        Range of the delay at low frequency that may be the plant's own.
     """
     mean = mean_response(measured)
     others = alternatives(_thinned(_within(mean, fit)), fit)
@@ -102,7 +102,7 @@ def _moved(plant: PlantSpec, frequency: float, damping: float) -> PlantSpec:
 
 
 class _Draws:
-    """A response as it might have come out."""
+    """Random draws of a response within its uncertainty."""
 
     def __init__(
         self, measured: Sequence[FrequencyResponse], mean: FrequencyResponse, fit: Fit

@@ -1,11 +1,11 @@
-"""Uncertainty of a measured spectrum: deviations that a model need not explain.
+"""The uncertainty of a measured spectrum: deviations that a model need not explain.
 
 Two tables of one axis, taken minutes apart, differ by more than counting noise, and differ
 smoothly: the level drifts with friction and temperature, a peak moves by a fraction of a hertz,
-and where little of the motion arrives, something else moves the sensor. A fit that takes every
-such difference for the machine invents modes, and with them phase. Here the errors have a white
-part, bin by bin, and a smooth one that neighbouring frequencies share; how large and how smooth is
-itself not known, so several answers are given and all of them are used.
+and where the response is small, other motion dominates the sensor. A fit that explains every such
+difference invents modes, and with them phase. Here the errors have a white part, independent by
+bin, and a smooth one that neighbouring frequencies share; size and smoothness are unknown, so
+several assumptions are used side by side.
 """
 
 from __future__ import annotations

@@ -2,10 +2,10 @@
 
 The drive is known, so |G| is absolute; the phase is not. What is fitted are modes without delay
 (`modal_structure`), seen through the window's bandwidth, with errors that bins share (`scatter`).
-One fit says little: others with more or fewer modes, with shares of other signs or modes beyond the
-band explain the same table. They are looked for from many starts, drawn anew from spectra as they
-might have come out (bootstrap; `spectrum_search`), and the result is all of them: some that differ
-most stand for the rest, weighted by how many they stand for.
+One fit is not enough: others with more or fewer modes, with shares of other signs or modes beyond
+the band explain the same table. They are searched from many starting points and for resampled
+spectra (bootstrap; `spectrum_search`). The result is a set of the most different ones, weighted by
+how many others each represents.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ _GOOD_DB, _NO_WORSE = 1.0, 1.1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Explained:
-    """What spectra say of an axis: a plant in the middle, and a set that stands for all others.
+    """Identification of an axis from spectra: a central plant, and a representative set.
 
     Attributes
     ----------

@@ -1,7 +1,7 @@
-"""Fits to a power spectral density, from many starts and to spectra as they might have come out.
+"""Search fits to a power spectral density from many starts, and to resampled spectra.
 
 Modes without delay (`modal_structure`), seen through the window's bandwidth, with errors that bins
-share (`scatter`). Of a fit counts its likelihood times what is usual of modes.
+share (`scatter`). Fits are ranked by likelihood times a prior of typical modes.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _SEEN, _UNSEEN_ZETA = 1.1, (0.005, 0.2)
 """Modes above this multiple of the highest bin were not seen; bounds of their damping."""
 _PEAKS = 4
 _MUCH_WORSE = 14.0
-"""Cost (twice the negative log-likelihood) beyond the best one that is no explanation any more."""
+"""Excess of cost (twice the negative log-likelihood) over the best at which a fit is rejected."""
 _PER_PARAMETER = 2.0
 """Cost of a parameter (Akaike 1974): a mode must explain more than three numbers of noise."""
 _SAME = 0.03
@@ -135,7 +135,7 @@ class Search:
     def candidates(self, progress: Callable[[float], None] | None) -> list[Candidate]:
         """Return fits from many starts, the best first."""
         whitening = whitening_of(SCATTERS[0].covariance(self.model))
-        # More of the larger ones: they have more ways to explain a spectrum.
+        # More starts for larger orders, which have more ways to explain a spectrum.
         likely = [n for n in self.orders for _ in range(n * n)]
         counts = [*self.orders, *self.rng.choice(likely, _STARTS - len(self.orders)).tolist()]
         found = []
@@ -162,7 +162,7 @@ class Search:
         return distinct
 
     def drawn(self, accepted: Sequence[Candidate], scatter: Scatter) -> list[Candidate]:
-        """Return fits to spectra as they might have come out."""
+        """Return fits to resampled spectra."""
         whitening = self._whitening(accepted, scatter)
         root = np.linalg.inv(whitening)
         likely = np.exp(-0.25 * (np.array([c.cost for c in accepted]) - accepted[0].cost))
@@ -176,7 +176,7 @@ class Search:
         return out
 
     def _rung(self, fit: Candidate) -> Candidate:
-        """Give modes beyond the band any damping: of them only a flank was seen."""
+        """Draw the damping of modes beyond the band, of which only the flank was measured."""
         n, vector = fit.structure.modes, fit.vector.copy()
         beyond = np.exp(fit.theta[:n]) * self._unit_hz > _SEEN * self.model.f_hz[-1]
         low, high = np.log(_UNSEEN_ZETA)
@@ -184,7 +184,7 @@ class Search:
         return replace(fit, vector=vector)
 
     def _whitening(self, fits: Sequence[Candidate], scatter: Scatter) -> Array:
-        """Whiten errors; where even the best fit leaves more than that, there is more of them."""
+        """Return the whitening of errors, enlarged if even the best fit leaves more."""
         covariance = scatter.covariance(self.model)
         whitening = whitening_of(covariance)
         best = fits[0]
@@ -220,7 +220,7 @@ class Search:
     def polished(
         self, start: Candidate, whitening: Array, log_psd: Array, rounds: int
     ) -> Candidate:
-        """Minimise whitened errors and what is unlikely of the parameters."""
+        """Minimise whitened errors plus the prior's penalty."""
         model, structure, n = self.model, start.structure, start.structure.modes
         band_hz = (_MODES_BAND[0] * model.f_hz[0], _MODES_BAND[1] * model.f_hz[-1])
         low, high = structure.bounds(band_hz, _ZETA_BAND, _SHARE_BAND)
@@ -275,5 +275,5 @@ class Search:
 
 
 def whitening_of(covariance: Array) -> Array:
-    """Return what makes errors of this covariance independent, of variance 1."""
+    """Return the matrix that makes errors of this covariance independent with variance 1."""
     return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)), np.float64)

@@ -1,4 +1,4 @@
-"""Limits of a measurement: models that are refused, and what to measure instead."""
+"""Refuse models that a measurement cannot support, and say what to measure instead."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ def check_informative(
     sources: Sequence[str],
     warnings: Sequence[str] = (),
 ) -> None:
-    """Refuse a model that the measurement does not tell.
+    """Refuse a model that the measurement does not determine.
 
     Parameters
     ----------
     warnings : sequence of str
-        What else was seen: often the reason.
+        Other findings, which are often the reason.
 
     Raises
     ------
@@ -55,7 +55,7 @@ def check_informative(
     for one in measured:
         _check_coherent(one, names)
     low, high = fit.band_hz
-    # Of a spectrum, what lies beyond the band only shapes its flank.
+    # In a spectrum, modes beyond the band only shape its flank.
     seen = [m for m in fit.modes if low <= m.f_hz <= high] if fit.magnitude_only else []
     main = max(seen or fit.modes, key=lambda m: m.peak, default=None)
     if main is None:

@@ -29,19 +29,19 @@ KEPT_FEATURES = frozenset(
         Feature.CUSTOM,
     }
 )
-"""Features that print as the file has them: their speeds are chosen for other reasons."""
+"""Features whose accelerations are not changed: their speeds are chosen for other reasons."""
 _VISIBLE = frozenset({Feature.OUTER_WALL, Feature.THIN_WALL})
 
 
 @dataclass(frozen=True, slots=True)
 class Bound:
-    """Bounds of a feature's acceleration [mm/s^2]; the file's own is brought between them."""
+    """Bounds of a feature's acceleration [mm/s^2]; the file's own is clamped to them."""
 
     at_least: float = 0.0
     at_most: float = np.inf
 
     def of(self, file_mm_s2: float) -> float:
-        """Return the acceleration where the file has another."""
+        """Return the file's acceleration, clamped to the bounds."""
         return min(max(file_mm_s2, self.at_least), self.at_most)
 
 
@@ -52,12 +52,12 @@ class Advice:
     Attributes
     ----------
     bounds : mapping
-        Feature id to bounds; features that are not named keep what the file has.
+        Feature id to bounds; features not listed keep the file's acceleration.
     shapers : sequence of (layer, Shaping)
-        From which layer on a shaper holds, rising; the first holds from the first line.
+        Layer from which each shaper applies, rising; the first applies from the first line.
         Empty: the firmware's own shaper stays.
     first_layer : FirstLayer
-        It keeps the file's accelerations.
+        Keeps the file's accelerations.
     """
 
     bounds: Mapping[int, Bound] = field(default_factory=dict)
@@ -65,7 +65,7 @@ class Advice:
     first_layer: FirstLayer = field(default_factory=FirstLayer)
 
     def keeps(self, moves: Moves) -> Mask:
-        """Mark the moves that stay as the file has them, travel as well."""
+        """Mark the moves whose acceleration stays as in the file, travel included."""
         return np.asarray(self.first_layer.has(moves) | ((moves.known & KEPT) != 0))
 
     def shaping(self, layer: int) -> Shaping | None:
@@ -86,12 +86,12 @@ def is_visible(name: str) -> bool:
 def wanted_accel(
     moves: Moves, limits: Sequence[Limits], advice: Advice, adviser: Adviser
 ) -> tuple[Array, Array]:
-    """Return the accelerations that moves shall have, and those that the file gives them.
+    """Return the advised acceleration of each move, and the one that the file sets.
 
     Returns
     -------
     wanted : ndarray, shape (n,)
-        NaN for moves that print nothing in X or Y.
+        NaN for moves that do not print in X or Y.
     file : ndarray, shape (n,)
     """
     prints = moves.prints

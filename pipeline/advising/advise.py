@@ -1,8 +1,8 @@
-"""Advise a print file: its moves stay, and firmware commands for shaper and acceleration are added.
+"""Add shaper and acceleration commands to a print file, leaving its moves unchanged.
 
-The sliced file is measured, samples of it are tried, the choice is written, and what was
-written is read and measured again: by the firmware's rules, with the firmware's own shaper as the
-written lines set it. Where a feature exceeds its bound there, it is made slower and written anew.
+The sliced file is measured, settings are tried on samples of it, and the choice is written. The
+written file is then read and measured by the firmware's rules, with the shaper that its lines set.
+A feature that exceeds its bound there is made slower, and the file is written again.
 """
 
 from __future__ import annotations
@@ -89,13 +89,13 @@ def advise_file(
     """Write a file with advice.
 
     Parameters and errors are those of `pipeline.compensate.compensate_file`. The slicer's times
-    in the file stay as they are, whatever `options.times` says: only lines of our own are added.
-    So no other choice makes the file smaller where it exceeds `options.max_mb`.
+    in the file stay, whatever `options.times` says, and no option makes the file smaller where it
+    exceeds `options.max_mb`: only lines of our own are added.
     """
     opened = file_rewriting(source, target, plate=options.plate, layers=layers, progress=progress)
     with opened as file, EarlierErrors(target.parent, 2) as earlier:
         container = file.container
-        # At first, too: with advice it is larger, and that takes its time.
+        # Check before the work starts, too: advice only makes the file larger.
         _check_size(source.name, container.text, options.max_mb)
         job = _Job(container.text, file.spool, machine, options, cache_dir, progress)
         result = job.run(source.name, container.facts(), earlier, file.layers)
@@ -105,7 +105,7 @@ def advise_file(
 
 
 def _check_size(name: str, text: BinaryIO, max_mb: float | None) -> None:
-    """See that a file is not larger than it may be; it stands at its beginning then."""
+    """Check the size of a file, and rewind it."""
     size_mb = 1e-6 * text.seek(0, io.SEEK_END)
     text.seek(0)
     if max_mb is not None and size_mb > max_mb:
@@ -116,7 +116,7 @@ def _check_size(name: str, text: BinaryIO, max_mb: float | None) -> None:
 
 
 class _Job:
-    """One file on its way."""
+    """One file being advised."""
 
     def __init__(
         self,
@@ -230,25 +230,25 @@ class _Job:
         """Write and measure until every feature is within its bound or at its slowest."""
         for attempt in range(_ROUNDS):
             writer = self._write(choice, first_layer)
-            after = SetErrors(self._machine, DT_S, stride=STRIDE)
+            set_errors = SetErrors(self._machine, DT_S, stride=STRIDE)
             shares = 0.6 + 0.03 * attempt, 0.8
-            written = self._go(self._spool, [after], "verifying", shares, lambda _: None)
-            now = after.errors()
+            written = self._go(self._spool, [set_errors], "verifying", shares, lambda _: None)
+            errors = set_errors.errors()
             over = {
-                f: now[f].rms_um / self._bound_um(f, was)
+                f: errors[f].rms_um / self._bound_um(f, was)
                 for f in choice.rung
-                if f in now and now[f].rms_um > _TOLERANCE * self._bound_um(f, was)
+                if f in errors and errors[f].rms_um > _TOLERANCE * self._bound_um(f, was)
             }
-            # The last round is for a file without advice.
+            # The last round is reserved for writing the file without advice.
             if attempt + 2 < _ROUNDS and over and choice.mended(over):
                 continue
-            worse = bool(over) or _rms_um(now) > _TOLERANCE * _rms_um(was)
+            worse = bool(over) or _rms_um(errors) > _TOLERANCE * _rms_um(was)
             worse |= written.time_s > was_s + _ROUNDING_S
             unbudgeted = self._options.budget_um is None and attempt + 1 < _ROUNDS
-            # Too little to choose from: what was there is better than any advice.
+            # No better than as sliced: withdraw the advice.
             if not (unbudgeted and worse and choice.withdrawn()):
                 break
-        return writer, now
+        return writer, errors
 
     def _bound_um(self, feature: int, was: dict[int, ClassError]) -> float:
         if self._options.budget_um is not None:

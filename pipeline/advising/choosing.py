@@ -1,9 +1,9 @@
 """Choose shaper and accelerations on samples from all over a file.
 
-Every type of shaper that the firmware has is tuned for the plants of the set: the frequencies at
-which the worst member errs least, where the walls count for as much as everything else. With each,
-every feature gets the highest acceleration of a ladder at which it stays within its bound. The
-shaper wins that brings the walls within their bounds, and then prints fastest.
+Every shaper type of the firmware is tuned for the plants of the set, to the frequencies that
+minimise the worst member's error, with walls weighted as much as everything else. With each, every
+feature gets the highest acceleration of a ladder that keeps it within its bound. The shaper is
+chosen that brings the walls within their bounds, and of those the one that prints fastest.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ _LOWEST_MM_S2, _LOW_RATIO = 100.0, 1.5
 _AIM = 0.95
 """Share of a bound that the samples may use."""
 _POINTS, _MEMBERS = 1000, 5
-"""Points and members with which frequencies are tuned; all members decide in the end."""
+"""Points and members used to tune frequencies; the final choice uses all members."""
 _COARSE = 6
 _TUNED_LEVELS = 5
 _MENDING_ROUNDS = 4
 _UNLIKE = 2.0
-"""Largest ratio between the samples' errors and those of the whole file, either way."""
+"""Largest ratio, either way, assumed between errors in the samples and in the whole file."""
 _SAME_TIME, _ROUNDING = 0.002, 1.001
 LEVEL_STEP = 0.02
 
@@ -57,21 +57,21 @@ ShareCallback = Callable[[float], None]
 
 @dataclass(slots=True)
 class Choice:
-    """What was chosen for a file, to be mended where the whole file shows that it must.
+    """What was chosen for a file; corrected where the whole file exceeds a bound.
 
     Attributes
     ----------
     rungs : list of float
         Accelerations [mm/s^2], rising.
     rung : dict
-        Feature id to the number of its rung; None: as the file has it.
+        Feature id to the index of its rung; None: as in the file.
     visible : set of int
         Features that may be made slower than the file has them.
     own_mm_s2 : dict
         Feature id to the highest acceleration that the file gives it.
     helpless : set of int
-        Features of these that no acceleration brings within their bounds: they get the quickest of
-        those with about the least error, and no slower.
+        Visible features that no acceleration brings within their bounds: they get the fastest of
+        the accelerations with about the least error.
     shapers : list of (layer, Shaping)
     """
 
@@ -95,17 +95,17 @@ class Choice:
         return Advice(self.bounds(), self.shapers, first_layer)
 
     def mended(self, over: Mapping[int, float]) -> bool:
-        """Slow features down whose errors exceed their bounds by a ratio; return if any could be.
+        """Slow down features that exceed their bounds; return whether any could be slowed.
 
         Parameters
         ----------
         over : mapping
-            Feature id to the ratio.
+            Feature id to the ratio of its error to its bound.
         """
         return bool(sum([self._slower(f, 1.0 / ratio) for f, ratio in over.items()]))
 
     def withdrawn(self) -> bool:
-        """Leave everything as the file has it; return whether anything was advised."""
+        """Withdraw all advice; return whether there was any."""
         advised = bool(self.shapers) or any(k is not None for k in self.rung.values())
         self.shapers, self.rung = [], dict.fromkeys(self.rung)
         return advised
@@ -132,18 +132,18 @@ class Choice:
 
 @dataclass(frozen=True, slots=True)
 class AsSliced:
-    """What a file does before anything is advised.
+    """A file as sliced, before anything is advised.
 
     Attributes
     ----------
     names : sequence of str
-        Of the features.
+        Names of the features.
     shaping : Shaping
-        What the printer would shape with.
+        The printer's shaper.
     errors_um : mapping
-        What every feature errs in the whole file.
+        Error of every feature in the whole file.
     levels : sequence of (layer, OperatingPoint)
-        Where the machine is from which layer on; more than one where plants follow a schedule.
+        Operating points and the layers at which they begin; several if plants follow a schedule.
     """
 
     names: Sequence[str]
@@ -171,11 +171,11 @@ def choose(
     machine : Machine
     adviser : Adviser
     budget_um : float, optional
-        What every feature may err; None: what it erred before.
+        Error allowed to every feature; None: its error as sliced.
     progress : callable, optional
-        Is given the share that is done.
+        Receives the share that is done.
     shaped : bool
-        A shaper may be advised.
+        Whether a shaper may be advised.
     """
     members = machine_numbers(machine, DT_S)
     as_sliced = Trial(samples, {}, machine, adviser, DT_S, members)
@@ -221,27 +221,27 @@ def _try_rungs(
     choice: Choice,
     progress: ShareCallback,
 ) -> list[_Found]:
-    """Try every shaper on the usual rungs, and on lower ones until one is fair to what shows."""
-    every = [_Found() for _ in by_point]
+    """Try every shaper on the normal rungs, then lower ones until visible features pass."""
+    results = [_Found() for _ in by_point]
 
-    def tried(rung: int | None) -> None:
+    def try_rung(rung: int | None) -> None:
         bounds: dict[int, Bound] = {}
         if rung is not None:
             accel = choice.rungs[rung]
             bounds = {f: _bound(accel, visible=f in choice.visible) for f in choice.rung}
         trial = trial_of(bounds)
-        for found, shapings in zip(every, by_point, strict=True):
+        for found, shapings in zip(results, by_point, strict=True):
             found.add(rung, trial.errors(shapings), trial.seconds)
-        progress(0.5 + 0.5 * len(every[0].um) / (1 + len(choice.rungs)))
+        progress(0.5 + 0.5 * len(results[0].um) / (1 + len(choice.rungs)))
 
-    usual = [k for k, accel in enumerate(choice.rungs) if accel >= _LOW_MM_S2]
-    for rung in (None, *usual):
-        tried(rung)
-    for rung in reversed(range(len(choice.rungs) - len(usual))):
-        if any(all(limits.fair(found, f) for f in choice.visible) for found in every):
+    normal = [k for k, accel in enumerate(choice.rungs) if accel >= _LOW_MM_S2]
+    for rung in (None, *normal):
+        try_rung(rung)
+    for rung in reversed(range(len(choice.rungs) - len(normal))):
+        if any(all(limits.fair(found, f) for f in choice.visible) for found in results):
             break
-        tried(rung)
-    return every
+        try_rung(rung)
+    return results
 
 
 def ladder(highest_mm_s2: float, machine: Machine) -> list[float]:
@@ -257,7 +257,7 @@ def ladder(highest_mm_s2: float, machine: Machine) -> list[float]:
 
 @dataclass(frozen=True, slots=True)
 class _Found:
-    """What trials with one shaper have shown: by rung (None: as the file has it), by feature."""
+    """Results of trials with one shaper: by rung (None: as in the file), by feature."""
 
     um: dict[int | None, dict[int, float]] = field(default_factory=dict)
     seconds: dict[int | None, dict[int, float]] = field(default_factory=dict)
@@ -274,15 +274,15 @@ class _Found:
 
 @dataclass(frozen=True, slots=True)
 class _Limits:
-    """What features may err in the samples."""
+    """Errors allowed to features in the samples."""
 
     bound_um: dict[int, float]
     has_budget: bool
 
     def ratio(self, error_um: float, feature: int, rung: int | None) -> float:
-        """Return the part of its limit that an error is: the limit lies a margin below the bound.
+        """Return the ratio of an error to its limit, which lies a margin below the bound.
 
-        Without a budget none is needed where everything is as the file has it.
+        Without a budget, the file's own accelerations need no margin.
         """
         margin = _AIM if self.has_budget or rung is not None else 1.0
         return error_um / (_ROUNDING * margin * self.bound_um[feature])
@@ -297,11 +297,11 @@ class _Limits:
 
 
 def _best(
-    every: Sequence[_Found], limits: _Limits, choice: Choice
+    results: Sequence[_Found], limits: _Limits, choice: Choice
 ) -> tuple[int, dict[int, int | None]]:
-    """Return the number of the best shaper, and the rung of every feature with it."""
+    """Return the index of the best shaper, and the rung of every feature with it."""
     ranked = []
-    for number, found in enumerate(every):
+    for number, found in enumerate(results):
         rungs = {
             f: _quickest(found, f, limits, choice.rungs, visible=f in choice.visible)
             for f in choice.rung
@@ -311,15 +311,15 @@ def _best(
         seconds = sum(found.time_s(f, k) for f, k in rungs.items())
         ranked.append((missed, seconds, max(ratios), number, rungs))
     least = min(r[0] for r in ranked)
-    fair = [r for r in ranked if r[0] == least]
-    quickest = min(r[1] for r in fair)
-    close = [r for r in fair if r[1] <= quickest * (1.0 + _SAME_TIME)]
+    eligible = [r for r in ranked if r[0] == least]
+    quickest = min(r[1] for r in eligible)
+    close = [r for r in eligible if r[1] <= quickest * (1.0 + _SAME_TIME)]
     return min(close, key=lambda r: (r[2], r[3]))[3:]
 
 
 @dataclass(frozen=True, slots=True)
 class _Candidate:
-    """A shaper for each level (one for all where it is not ours)."""
+    """A shaper for each level; `ours` is False for the printer's previous setting."""
 
     shapings: list[Shaping]
     ours: bool
@@ -379,7 +379,7 @@ def _tuned(
     *,
     same: bool,
 ) -> tuple[int, int]:
-    """Return the numbers of the frequencies of X and Y at which the worst member errs least."""
+    """Return the frequency indices of X and Y that minimise the worst member's error."""
     answers: dict[tuple[int, int, int], np.ndarray] = {}
     known: dict[tuple[int, int], float] = {}
     top = len(FREQUENCIES_HZ) - 1
@@ -427,7 +427,7 @@ def _by_point(
     levels: Sequence[tuple[int, OperatingPoint]],
     machine: Machine,
 ) -> Mapping[OperatingPoint, Shaping] | Shaping:
-    """Return the shaper of every sample's point."""
+    """Return the shaper at every sample's operating point."""
     if len(levels) == 1:
         return candidate.shapings[0]
     grid = OperatingGrid(machine, step=LEVEL_STEP, blend_step=LEVEL_STEP)
@@ -452,24 +452,24 @@ def _quickest(
     *,
     visible: bool,
 ) -> int | None:
-    """Return the rung with the least time of those within the limit.
+    """Return the fastest rung within the limit.
 
-    Where there is none: the file's own, or for what is seen the quickest of those with about the
-    least error that are not low.
+    If there is none: the file's own; for visible features the fastest within the bound, or else
+    of those with about the least error, low rungs excluded.
     """
 
     def key(rung: int | None) -> tuple[float, int]:
         return round(found.time_s(feature, rung), 4), -1 if rung is None else rung
 
-    fair = limits.fair(found, feature)
-    if not fair and not visible:
+    eligible = limits.fair(found, feature)
+    if not eligible and not visible:
         return None
-    fair = fair or limits.reaching(found, feature)
-    if not fair:
-        usual = [k for k in found.um if k is None or rungs[k] >= _LOW_MM_S2]
-        least = min(found.error(feature, k) for k in usual)
-        fair = [k for k in usual if found.error(feature, k) <= 1.05 * least]
-    return min(fair, key=key)
+    eligible = eligible or limits.reaching(found, feature)
+    if not eligible:
+        normal = [k for k in found.um if k is None or rungs[k] >= _LOW_MM_S2]
+        least = min(found.error(feature, k) for k in normal)
+        eligible = [k for k in normal if found.error(feature, k) <= 1.05 * least]
+    return min(eligible, key=key)
 
 
 def _own_mm_s2(samples: FileSamples, adviser: Adviser) -> dict[int, float]:

@@ -1,11 +1,11 @@
-"""Write the advised file: the lines of the original, and between them lines of our own.
+"""Write the advised file: the lines of the original with lines of our own between them.
 
-Every line of our own stands by itself and carries `MARK`. Whoever deletes the lines with the mark
-has the original, byte for byte.
+Every inserted line stands by itself and carries `MARK`: deleting the marked lines restores the
+original, byte for byte.
 
-The file's own commands keep their meaning. Where it sets an acceleration, or a shaper, ours is set
-again after it; before lines that may do anything (homing, macros, pauses, a change of tool) the
-printer gets back what the file has set, and after them ours again.
+The file's own commands keep their meaning. After a line that sets an acceleration or a shaper, ours
+is set again. Before lines that may do anything (homing, macros, pauses, tool changes) the printer
+gets the file's settings back, and after them ours again.
 """
 
 from __future__ import annotations
@@ -48,18 +48,18 @@ class AdviceWriter:
     adviser : Adviser
     advice : Advice
     names : list of str
-        The reader's names of features; it may grow.
+        Feature names of the reader; the list grows as the file is read.
     initial : Limits
-        Before the first line.
+        Limits before the first line.
     stamp : str
-        Says who processed the file.
+        Version and options, for the header.
 
     Attributes
     ----------
     lines : int
-        Lines of our own.
+        Number of inserted lines.
     shaper_left : bool
-        Nobody knew at last what the printer's shaper was before: ours stays, in part at least.
+        At the end the printer's previous shaper was unknown: ours stays, at least in part.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class AdviceWriter:
         self._shaped = False
         self._own_shaper: dict[bytes, bytes] = {}
         """The file's own commands that set a shaper, the last of each form."""
-        # A line may hold others before and after it.
+        # One line may contain several commands.
         self._sets_shaper = re.compile(
             rb"\b%s\b(?:(?![GMT]\d)[^;])*" % adviser.shaper_word.encode(), re.IGNORECASE
         )
@@ -85,18 +85,18 @@ class AdviceWriter:
         self.shaper_left = False
 
     def header(self) -> bytes:
-        """Lines that say who processed the file, and how to undo it."""
+        """Return lines that say who processed the file, and how to undo it."""
         return self.footer() + self._line(
             b"", "without the lines that hold this mark, the file is as it came"
         )
 
     def footer(self) -> bytes:
-        """Line that says who processed the file."""
+        """Return the line that says who processed the file."""
         self.lines += 1
         return f"; Processed by stillpath {self._stamp} ".encode() + MARK + b"\n"
 
     def block(self, block: ProgramBlock) -> bytes:
-        """Return the text of a block with the lines that belong into it."""
+        """Return the text of a block with our lines inserted."""
         parts: list[bytes] = []
         done = 0
         for at, is_move, row in self._places(block):
@@ -108,31 +108,31 @@ class AdviceWriter:
         return b"".join(parts)
 
     def end(self) -> bytes:
-        """Return lines that give the printer back, at the end of the file."""
+        """Return the lines for the end of the file that restore the printer's settings."""
         text = self._give_back()
         if self._shaped:
             text += self._give_shaper_back()
         return text + self.footer()
 
     def _places(self, block: ProgramBlock) -> list[tuple[int, bool, int]]:
-        """Return where lines may be needed: offset in the text, whether a move, and its row."""
+        """Return where lines may be needed: text offset, whether a move, and row."""
         moves, events, start = block.moves, block.events, block.text_offset
-        heeded = np.flatnonzero(np.isin(events.kind, _HEEDED))
-        places = [(int(events.byte_start[k]) - start, False, k) for k in heeded.tolist()]
+        relevant = np.flatnonzero(np.isin(events.kind, _HEEDED))
+        places = [(int(events.byte_start[k]) - start, False, k) for k in relevant.tolist()]
         if len(moves):
             self._wanted, self._theirs = wanted_accel(
                 moves, block.limits, self._advice, self._adviser
             )
             due = np.zeros(len(moves), dtype=bool)
             due[0] = True
-            # NaN is never equal: one of a row of travels is enough.
+            # NaN never equals NaN: replace it, so that only the first of several travels is due.
             self._kept = self._advice.keeps(moves)
             key = np.where(np.isnan(self._wanted), -1.0 - self._kept, self._wanted)
             due[1:] = (key[1:] != key[:-1]) | (moves.layer[1:] != moves.layer[:-1])
             due[1:] |= moves.limits_id[1:] != moves.limits_id[:-1]
-            after = events.move_index[heeded] - block.first_move
+            after = events.move_index[relevant] - block.first_move
             due[after[after < len(moves)]] = True
-            # Of the pieces of an arc only the first has a line before it.
+            # A line can be inserted only before the first segment of an arc.
             due[1:] &= moves.byte_start[1:] != moves.byte_start[:-1]
             rows = np.flatnonzero(due).tolist()
             places += [(int(moves.byte_start[k]) - start, True, k) for k in rows]
@@ -149,7 +149,7 @@ class AdviceWriter:
                 lead += self._give_shaper_back()
             self._now, self._shaper, self._rests = None, None, True
         elif kind == EventKind.OBJECT and self._adviser.skips_lines:
-            # Whoever leaves an object out does not read our lines in it.
+            # A host that excludes an object skips our lines inside it.
             lead = self._give_back()
             self._now = None
         elif kind == EventKind.SHAPER:
@@ -165,23 +165,23 @@ class AdviceWriter:
         return lead
 
     def _move(self, block: ProgramBlock, row: int) -> bytes:
-        wanted, theirs = float(self._wanted[row]), float(self._theirs[row])
-        if theirs != self._file:
-            # Set in the line of a move.
-            self._file = self._now = theirs
+        wanted, file_accel = float(self._wanted[row]), float(self._theirs[row])
+        if file_accel != self._file:
+            # The line of the move itself sets the acceleration.
+            self._file = self._now = file_accel
         self._layer = int(block.moves.layer[row])
         prints = not np.isnan(wanted)
         lead = self._set_shaper(prints)
         self._rests = False
         if prints:
-            unknown_but_theirs = self._now is None and wanted == self._file
-            if self._now != wanted and not unknown_but_theirs:
+            file_accel_in_force = self._now is None and wanted == self._file
+            if self._now != wanted and not file_accel_in_force:
                 lead += self._accel(wanted, self._title(int(block.moves.feature[row])))
         elif self._now is not None and (
             (self._now < self._file and not self._adviser.travel_apart)
             or (self._now != self._file and self._kept[row])
         ):
-            # Travel is not made slower than the file has it, nor quicker where nothing may change
+            # Travel is never slower than in the file, nor faster where nothing may change
             # (Marlin wipes with the acceleration of moves that print).
             lead += self._accel(self._file, "travel")
         return lead
@@ -205,15 +205,15 @@ class AdviceWriter:
         return b"".join(self._line(line, "the printer's own shaper") for line in lines)
 
     def _sets_all(self, lines: Sequence[bytes]) -> bool:
-        """Return whether these lines replace all of our settings: no axis keeps its type."""
-        left = Shaping(_OURS, _OURS)
+        """Return whether these lines replace our shaper on both axes."""
+        remaining = Shaping(_OURS, _OURS)
         with contextlib.suppress(ValueError):
             for line in lines:
-                left = self._adviser.read_shaper(line.decode("utf-8", "replace"), left)
-        return _OURS.type not in (left.x.type, left.y.type)
+                remaining = self._adviser.read_shaper(line.decode("utf-8", "replace"), remaining)
+        return _OURS.type not in (remaining.x.type, remaining.y.type)
 
     def _give_back(self) -> bytes:
-        """Set the acceleration that the file has set."""
+        """Return the lines that restore the acceleration set by the file."""
         if self._now is None or self._now == self._file:
             return b""
         return self._accel(self._file, "as the file has it")
@@ -237,13 +237,13 @@ class AdviceWriter:
 def write_advised(
     source: BinaryIO, out: BinaryIO, reader: Interpreter, writer: AdviceWriter
 ) -> None:
-    """Write a text with advice; whatever was in the file is lost, and it stands at its start.
+    """Write a text with advice to `out`, replacing its contents, and rewind it.
 
     Parameters
     ----------
     source, out : binary files
     reader : Interpreter
-        Fresh, the one whose names of features the writer has.
+        Unused so far; the writer shares its list of feature names.
     writer : AdviceWriter
     """
     out.seek(0)
@@ -260,7 +260,7 @@ def write_advised(
                 tail = out.tell() + end
             out.write(text)
     rest = b"".join(block.text for block in reader.flush())
-    # After a line without an end nothing can be added: the end comes before it.
+    # Nothing can follow a line without a newline: our end goes before it.
     if header or behind_last_command(rest):
         tail = out.tell()
     out.write(rest)
@@ -269,13 +269,13 @@ def write_advised(
 
 
 def _first_command(text: bytes) -> int:
-    """Return where the first line begins that is no comment: what slicers say comes before it."""
+    """Return the offset of the first line that is not a comment, after the slicer's header."""
     found = _COMMAND.search(text)
     return found.start() if found else -1
 
 
 def _insert(file: BinaryIO, at: int, text: bytes) -> None:
-    """Put text into a file: slicers look for their settings at its very end."""
+    """Insert text into a file: the slicer's settings must stay at its very end."""
     for stop in range(file.seek(0, io.SEEK_END), at, -_BLOCK_BYTES):
         start = max(stop - _BLOCK_BYTES, at)
         file.seek(start)

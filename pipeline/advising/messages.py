@@ -15,11 +15,11 @@ def shaper_warnings(unmodelled: Sequence[str], *, none_known: bool, left: bool) 
     Parameters
     ----------
     unmodelled : sequence of str
-        Types that the machine states and that have no model.
+        Shaper types in the machine document that have no model.
     none_known : bool
-        The firmware takes none from a file.
+        The firmware does not take a shaper from a file.
     left : bool
-        Ours stays in force after the file.
+        Our shaper stays in force after the file.
     """
     found = [
         f"The shaper {kind} (firmware.shaper in the machine) has no model: figures of the file "
@@ -46,8 +46,8 @@ def stored_settings(lines: Sequence[int], *, shaper: str | None) -> list[str]:
     ----------
     lines : sequence of int
     shaper : str, optional
-        What the printer gets back before them; empty: it had it all along; None: unknown, so
-        none is advised.
+        Shaper restored before them; empty: it was never changed; None: unknown, so none is
+        advised.
     """
     if not lines:
         return []
@@ -69,7 +69,7 @@ def beyond_bounds(
     *,
     has_budget: bool,
 ) -> list[str]:
-    """Return warnings about visible features whose errors exceed their bounds, and why.
+    """Return warnings about visible features that exceed their bounds, with the reason.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""First reading of a file to be advised: collects its contents, or refuses it."""
+"""First pass over a file to be advised: collects what is needed, or refuses the file."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ __all__ = ["FirstReading"]
 
 
 class FirstReading:
-    """What is noted while the sliced file is read.
+    """What the first pass over the sliced file collects.
 
     Attributes
     ----------
     levels : list of (layer, OperatingPoint)
-        Where the machine is from which layer on, as far as its plants notice.
+        Operating points that differ for the plants, and the layers at which they begin.
     stored_lines : list of int
-        Lines that store for good what is in force.
+        Lines that save the settings in force permanently.
     """
 
     def __init__(self, machine: Machine, adviser: Adviser) -> None:
@@ -42,7 +42,7 @@ class FirstReading:
         self.stored_lines: list[int] = []
 
     def see(self, block: ProgramBlock) -> None:
-        """Take note of a block; refuse a file that was processed, or could not be restored."""
+        """Process a block; refuse a file that was processed, or could not be restored."""
         refuse_processed(block, "advise")
         if MARK in block.text:
             raise GcodeError(

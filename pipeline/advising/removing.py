@@ -1,4 +1,4 @@
-"""Take advice out of a file again."""
+"""Remove advice from a file."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ def remove_advice(source: Path, target: Path, *, plate: int | None = None) -> in
     Parameters
     ----------
     source, target : Path
-        Any print file; the target is of the same kind, and written whole or not at all. They may
-        be the same file.
+        Any print file; the target is of the same kind and written atomically. They may be the
+        same file.
     plate : int, optional
         Which plate of a 3MF package with several.
 
     Returns
     -------
     int
-        Lines that were taken out.
+        Number of lines removed.
 
     Raises
     ------
     GcodeError
-        There are none.
+        The file contains no advice.
     """
     removed = 0
     with (

@@ -1,7 +1,8 @@
 """Trials of some seconds of a print with other accelerations and other shapers.
 
-Shaper and plant are both linear, so they commute: the plants of the set answer the plan once, and
-the answer to a shaped plan is a few shifted copies of that, needed only where it is measured.
+Shaper and plant are both linear, so they commute: each plant's response to the plan is computed
+once, and the response to a shaped plan is a few shifted copies of it, needed only at the points
+that are measured.
 """
 
 from __future__ import annotations
@@ -32,20 +33,20 @@ Ints = NDArray[np.int64]
 
 _REST_S = 0.15
 _POINTS = 600
-"""Points that are measured of every feature."""
+"""Points measured for each feature."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Motion:
-    """The sampled motion of all samples, one after the other, rests between them."""
+    """The motion of all samples, concatenated with rests between them."""
 
     path_mm: Array
     feature: NDArray[np.int32]
     """-2 where nothing is printed."""
     bounds: list[tuple[int, int, OperatingPoint]]
-    """Samples [first, last) of each, and where the machine is."""
+    """Range [first, last) of each sample, and its operating point."""
     seconds: dict[int, float]
-    """How long each feature lasts; -2: all the rest."""
+    """Duration of each feature; -2: everything else."""
 
 
 class Trial:
@@ -62,12 +63,12 @@ class Trial:
     members : sequence
         Of `pipeline.measuring.set_errors.machine_numbers`.
     point : OperatingPoint, optional
-        Where the machine is; None: where it is when the samples are printed.
+        Operating point; None: that of each sample.
 
     Attributes
     ----------
     seconds : dict
-        Time of each feature; -2 of all the rest.
+        Time of each feature; -2: everything else.
     total_s : float
     """
 
@@ -99,16 +100,16 @@ class Trial:
 
     @property
     def features(self) -> list[int]:
-        """Ids of what is printed."""
+        """Ids of the printed features."""
         return list(self._index)
 
     def errors(self, shapings: Mapping[OperatingPoint, Shaping] | Shaping) -> dict[int, float]:
-        """Return the rms contour error [um] of every feature, that of the worst member.
+        """Return the worst member's rms contour error [um] of every feature.
 
         Parameters
         ----------
         shapings : Shaping, or mapping of it
-            For all points at which the samples are.
+            One for all operating points, or one for each.
         """
         at = self._at
         error = self._distances(shapings, at)
@@ -134,7 +135,7 @@ class Trial:
         return out
 
     def points(self, count: int, chosen: Sequence[int]) -> Ints:
-        """Return some samples, one half of the features that are chosen, one half of others."""
+        """Return sample indices, half from the chosen features and half from the others."""
         halves = [
             [i for f, i in self._index.items() if (f in chosen) is one] for one in (True, False)
         ]
@@ -147,7 +148,7 @@ class Trial:
         return np.unique(np.concatenate(found)) if found else np.zeros(0, np.int64)
 
     def axis_answer(self, member: int, axis: int, kind: str, f_hz: float, at: Ints) -> Array:
-        """Return positions of one axis at chosen samples under one shaper, of one member."""
+        """Return one member's positions of one axis at chosen samples, under one shaper."""
         pulses = AxisShaper(kind, f_hz).pulses()
         return shaped_at(self._answers[member][axis], self._dt_s, pulses, at)
 
@@ -197,7 +198,7 @@ def _motion(
         position, row = sample_phases(phases, (float(phases.t_s[0]), dt_s, round(total_s / dt_s)))
         if position.shape[1] == 0:
             continue
-        # Errors do not depend on the place; without a jump nothing vibrates between samples.
+        # Contour errors do not depend on position; joining the samples excites no vibration.
         path = position[:2] - position[:2, :1] + stands_at[:, None]
         stands_at = path[:, -1]
         paths.append(np.pad(path, ((0, 0), (pad, pad)), mode="edge"))
@@ -210,7 +211,7 @@ def _motion(
 
 
 def _planned(sample: Sample, advice: Advice, machine: Machine, adviser: Adviser) -> Phases:
-    """Plan a sample with the accelerations that are advised."""
+    """Plan a sample with the advised accelerations."""
     piece = sample.piece
     moves = piece.moves
     wanted, file = wanted_accel(moves, piece.limits, advice, adviser)
@@ -229,7 +230,7 @@ def _planned(sample: Sample, advice: Advice, machine: Machine, adviser: Adviser)
 
 
 def _chosen(feature: NDArray[np.int32], wanted: int) -> Ints:
-    """Choose samples of a feature, one of each cell: they share no rhythm with the motion."""
+    """Choose samples of a feature, one per cell at random to avoid aliasing with the motion."""
     rows = np.flatnonzero(feature == wanted)
     step = max(1, len(rows) // _POINTS)
     offset = np.random.default_rng(1).integers(0, step, len(rows) // step)

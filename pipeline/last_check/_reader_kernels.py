@@ -1,6 +1,6 @@
-"""Kernels of the last check's own reader: lines like ``G1 X10.5 Y-3 E.02 F1800``, and few others.
+"""Kernels of the last check's reader for plain lines such as ``G1 X10.5 Y-3 E.02 F1800``.
 
-A state is an array of `SIZE` floats; nan is what nobody knows. Text ends with a newline.
+A state is an array of `SIZE` floats; nan means unknown. Text ends with a newline.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ __all__ = [
 ]
 
 X, Y, Z, E, FED, F, UNIT, RELATIVE, RELATIVE_E, WAITS, SIZE = range(11)
-"""Place of a state [mm]: x y z, what E reads, filament fed since the beginning; F [mm/min];
-mm of the file's unit; 1 where coordinates, or those of E, are relative; 1 after a move of X and Y
-so short that the firmware may carry it out with the next one."""
+"""Indices of a state: x y z, E, filament fed since the beginning [mm]; F [mm/min]; the file's unit
+[mm]; 1 where coordinates, or those of E, are relative; 1 after a move of X and Y so short that the
+firmware may execute it with the next one."""
 WORD_COUNT = 7
-"""X Y Z E F, and I J of arcs."""
+"""X Y Z E F, and I J for arcs."""
 SAME, PLACE, FILAMENT, FEED, MODES = -1, 0, 4, 5, 7
-"""What `compare` finds: nothing, or the first of a state's numbers that differs."""
+"""Results of `compare`: nothing, or the first number of a state that differs."""
 WORDS, WITHIN = 15, 32
-"""For the mask of `compare`: words that make a move, and whether it is one within a stream."""
+"""Bits in the mask of `compare`: words of a move, and whether it lies within a stream."""
 
 _POWERS = 10.0 ** np.arange(16)
 _LONGEST = 90
@@ -43,10 +43,10 @@ _FEED_MM_MIN, _FEED_SHARE = 1e-4, 2e-6
 
 @kernel(force_inline=True, allocates=False)
 def _words(text: Any, at: int, words: Any, arcs: bool) -> tuple[int, int]:
-    """Read a plain G0 or G1; return where the next line begins, or -1, and which words there are.
+    """Parse a plain G0 or G1; return where the next line begins, or -1, and the mask of its words.
 
-    Bits 0 to 4 of the latter: X Y Z E F. Words are parted by blanks and have a plain number.
-    With `arcs` it may be a G2 or G3 with a centre too, which has bits 5 or 6: I J.
+    Bits 0 to 4 of the mask: X Y Z E F. Words are separated by blanks and have plain numbers.
+    With `arcs`, G2 and G3 with a centre are parsed too (bits 5 and 6: I J).
     """
     mask = 0
     number = text[at + 1] - 48
@@ -105,9 +105,9 @@ def _words(text: Any, at: int, words: Any, arcs: bool) -> tuple[int, int]:
 
 @kernel(force_inline=True, allocates=False)
 def _comments(text: Any, at: int, stop: int, marks: bool) -> tuple[int, int]:
-    """Pass over empty lines and comments; return where the next line begins, and how many.
+    """Skip empty lines and comments; return where the next line begins, and how many were skipped.
 
-    With `marks` a comment that may be a mark of ours is none.
+    With `marks`, a comment that may be a mark of ours is not skipped.
     """
     lines = 0
     while at < stop:
@@ -125,7 +125,7 @@ def _comments(text: Any, at: int, stop: int, marks: bool) -> tuple[int, int]:
 
 @kernel(force_inline=True, allocates=False)
 def way_xy_mm(state: Any, words: Any, mask: int) -> float:
-    """Return how far a move goes in X and Y [mm]; nan where that is not known."""
+    """Return the length of a move in X and Y [mm]; nan if unknown."""
     squares = 0.0
     for axis in range(2):
         if mask >> axis & 1:
@@ -140,7 +140,7 @@ def way_xy_mm(state: Any, words: Any, mask: int) -> float:
 
 @kernel(force_inline=True, allocates=False)
 def move(state: Any, words: Any, mask: int) -> None:
-    """Carry out a move."""
+    """Update the state by a move."""
     for axis in range(3):
         if mask >> axis & 1:
             value = words[axis] * state[UNIT]
@@ -163,9 +163,9 @@ def move(state: Any, words: Any, mask: int) -> None:
 
 @kernel(force_inline=True, allocates=False)
 def may_be_no_arc(state: Any, words: Any, mask: int) -> bool:
-    """Whether a firmware may take an arc with a centre for one of no length, and pass over it.
+    """Return whether a firmware may treat an arc with a centre as one of zero length and skip it.
 
-    Its end is then seen from the centre in the direction of its beginning, without being there.
+    That is so if its end lies in the same direction from the centre as its start, but elsewhere.
     """
     i_mm = words[5] * state[UNIT] if mask & 32 else 0.0
     j_mm = words[6] * state[UNIT] if mask & 64 else 0.0
@@ -183,9 +183,9 @@ def may_be_no_arc(state: Any, words: Any, mask: int) -> bool:
 
 @kernel(force_inline=True, allocates=False)
 def settle(state: Any, way_mm: float, shortest_mm: float, z_mm: float, fed_mm: float) -> None:
-    """Note after a move whether it waits, from where Z and filament were before it.
+    """Note after a move whether it is still pending, given Z and filament before it.
 
-    What waits is carried out with the next move that is long enough, of whatever axis.
+    A pending move is executed with the next one that is long enough in any axis.
     """
     waits = state[WAITS] == 1.0 if way_mm == 0.0 else way_mm <= shortest_mm
     others_mm, more_mm = fabs(state[Z] - z_mm), fabs(state[FED] - fed_mm)
@@ -196,18 +196,19 @@ def settle(state: Any, way_mm: float, shortest_mm: float, z_mm: float, fed_mm: f
 
 @kernel(allocates=False)
 def compare(one: Any, other: Any, mask: int, place_mm: Any, filament_mm: float) -> int:
-    """Compare two states; what one of them does not know is passed over.
+    """Compare two states; values unknown in either are skipped.
 
     Parameters
     ----------
     one, other : float array
-        Of the original and of the written file. Filament counts anew where one does not know it.
+        Of the original and of the written file. Where either does not know the filament, counting
+        restarts.
     mask : int
-        Words of the move after which they stand; 0: no move, and F does not count. With `WITHIN`
-        a stream, where what E reads is set right before lines that depend on it only.
+        Words of the move just made; 0: no move, and F is not compared. With `WITHIN`: in a stream,
+        where E is corrected only before lines that depend on it.
     place_mm : float array, shape (3,)
     filament_mm : float
-        By how much they may differ.
+        Tolerances.
     """
     for axis in range(3):
         if fabs(one[axis] - other[axis]) > place_mm[axis]:
@@ -229,9 +230,9 @@ def compare(one: Any, other: Any, mask: int, place_mm: Any, filament_mm: float) 
 
 @kernel(allocates=False)
 def compare_before(before: Any, after: Any, state: Any, place_mm: Any, filament_mm: float) -> int:
-    """Compare the states before a line of a stream, of which the original knows both.
+    """Compare the state before a line of a stream with the original's.
 
-    Where filament counts anew before it, it does so after it too.
+    If filament counting restarts before the line, it does so after it too.
     """
     if isnan(before[FED]) or isnan(state[FED]):
         after[FED] = nan
@@ -252,7 +253,7 @@ def ours(
     place_mm: Any,
     filament_mm: float,
 ) -> tuple[int, int, bool, int]:
-    """Carry out plain moves of a stream, up to the line that is waited for or an odd one.
+    """Execute plain moves of a stream up to the awaited line, or to one that is not plain.
 
     Parameters
     ----------
@@ -261,9 +262,9 @@ def ours(
         Where to begin, and after the last newline.
     state, words : float array
     wanted : uint8 array
-        A line of the original, without its end; may be empty. It is carried out if it is plain.
+        The awaited line of the original without its newline; may be empty. Executed if plain.
     rests : bool
-        The states before it and after it are compared with those of the original.
+        Compare the states before and after it with those of the original.
     before, after : float array
         States of the original.
     place_mm, filament_mm
@@ -272,8 +273,8 @@ def ours(
     Returns
     -------
     (int, int, bool, int)
-        Where the next line begins, how many were carried out, whether the last was the one that is
-        waited for, and what differs there.
+        Where the next line begins, how many lines were executed, whether the last was the awaited
+        one, and what differs there.
     """
     lines = 0
     length = len(wanted)
@@ -320,28 +321,28 @@ def carry_out_moves(
     before: Any,
     perhaps: Any,
 ) -> tuple[int, int, int, int]:
-    """Carry out plain moves of the original that may move X or Y, and one that surely does not.
+    """Execute plain moves of the original that may move X or Y, and the next that does not.
 
     Parameters
     ----------
     text, at, stop, state, words
         As of `ours`.
     most : int
-        So many lines at most.
+        Largest number of lines.
     shortest_mm : float
         A move that is no longer than this in X and Y may be joined with the next one.
     arcs, divides_extruder : bool
         Arcs in the plane of X and Y are plain moves, and give each of their pieces a part of E.
     before : float array
-        Takes the state before the one that does not move X or Y.
+        Receives the state before the line that does not move X or Y.
     perhaps : int array
-        Takes where those begin of which nobody knows whether they move X or Y; so many at most.
+        Receives the offsets of lines that may or may not move X or Y; its size is the limit.
 
     Returns
     -------
     (int, int, int, int)
-        Where the next line begins, how many were carried out, which words the last has if it does
-        not move X or Y (else -1), and how many are in `perhaps`.
+        Where the next line begins, how many lines were executed, the words of the last if it does
+        not move X or Y (else -1), and the count in `perhaps`.
     """
     lines, found = 0, 0
     while at < stop and lines < most and found < len(perhaps):
@@ -399,7 +400,7 @@ def compare_moves(
     place_mm: Any,
     filament_mm: float,
 ) -> tuple[int, int, int, int, int, int, int, int]:
-    """Carry out plain moves that both texts share, and compare the states after each.
+    """Execute plain moves that both texts share, and compare the states after each.
 
     Parameters
     ----------
@@ -415,9 +416,9 @@ def compare_moves(
     Returns
     -------
     (int, int, int, int, int, int, int, int)
-        Where both texts go on, how many lines of each were passed, how many moves were carried
-        out, how many of these without X and Y known, how many lines stand before the first with
-        them, and what differs after the last.
+        Where both texts go on, how many lines of each were read, how many moves were executed, how
+        many of these with X and Y unknown, how many lines precede the first with them known, and
+        what differs after the last.
     """
     lines, written_lines, moves, unknown, before_known = 0, 0, 0, 0, -1
     while True:

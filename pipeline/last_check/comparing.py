@@ -1,8 +1,8 @@
-"""Follow original and written file side by side, and compare them at every line they share.
+"""Follow the original and the written file in parallel, comparing them at every shared line.
 
 Outside of streams the written file holds every line of the original. Within one, straight lines of
-ours stand for its moves of X and Y; all other lines are there in order, or held back as comments.
-The original holds no marks of ours: such files are refused.
+ours replace its moves of X and Y; all other lines are there in order, or commented out.
+The original contains no marks of ours: such files are refused.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ _ANYWHERE = re.compile(
     rb"|M900|M97[45])(?![\d.])",
     re.IGNORECASE,
 )
-"""Lines that we write outside of streams too: standing still, limits, the firmware's shaper."""
+"""Lines of ours that may also stand outside of streams: dwells, limits, the firmware's shaper."""
 _SHAPER = re.compile(rb"SET_INPUT_SHAPER|M593(?!\d)|M493(?!\d)", re.IGNORECASE)
-"""The file's own line for the shaper, which we repeat, may hold more than that."""
+"""The file's own shaper line, which we repeat, may contain other commands."""
 _IN_STREAM = re.compile(
     _ANYWHERE.pattern + rb"|G1 (?:[XYZEF]-?[\d.]+ ?)+$|G9[01]$|M8[23]$|G92 E-?[\d.]+$",
     re.IGNORECASE,
@@ -50,19 +50,19 @@ _IN_STREAM = re.compile(
 
 
 class LastCheck:
-    """A file to write to, which reads along and compares with the original.
+    """A writable file that compares what passes through it with the original.
 
     Parameters
     ----------
     target : file
-        Where to hand on what is written.
+        Receives what is written.
     original : binary file
-        Text of the original; is read from its beginning.
+        Text of the original, read from its beginning.
     machine : Machine
     step_mm : tuple of float
-        Grid of the firmware's x, y, z; 0: none. Where streams end the written file may be one off.
+        Grid of the firmware's x, y, z; 0: none. Streams may end one grid step off.
     shortest_mm : float
-        The firmware joins shorter moves with the next one; 0: it does not.
+        The firmware merges shorter moves into the next one; 0: it does not.
 
     Attributes
     ----------
@@ -86,14 +86,13 @@ class LastCheck:
         self._place_mm = _PLACE_MM + np.array(step_mm[:3], float)
         self._words = np.zeros(at.WORD_COUNT)
         self._idle: set[bytes] = set()
-        """Lines of ours that leave place and modes as they are."""
+        """Lines of ours that change neither position nor modes."""
         self._streaming, self._stream_line = False, 0
         self._begun: deque[Place] = deque(maxlen=16)
-        """Where the original was after its last lines within the stream."""
+        """Places in the original after its last lines within the stream."""
         self._wanted: Wanted | None = None
         self._earlier: deque[bytes] = deque(maxlen=64)
-        """Lines taken for the first of several with their text, or for ours; perhaps they were not.
-        """
+        """Lines matched to the first of several equal ones, or to ours, perhaps wrongly."""
         self._kept = self._compared = 0
         self._gap_line = 0
         self._gaps: list[str] = []
@@ -101,7 +100,7 @@ class LastCheck:
         self.cpu_s = 0.0
 
     def write(self, data: bytes) -> int:
-        """Forward what is written, and compare it.
+        """Forward and compare what is written.
 
         Raises
         ------
@@ -120,7 +119,7 @@ class LastCheck:
         return len(data)
 
     def finish(self) -> LastCheckFigures:
-        """Compare the end, and return what was compared.
+        """Compare the end, and return the figures of the check.
 
         Raises
         ------
@@ -160,7 +159,7 @@ class LastCheck:
             raise
 
     def _lines(self) -> None:
-        """Follow what stands outside of streams: moves of both, and another line."""
+        """Compare shared moves outside of streams, and the line after them."""
         written, original = self._written, self._original.text
         if original.is_read:
             self._original.read_on()
@@ -217,7 +216,7 @@ class LastCheck:
         written.skip(next_at)
 
     def _stream(self) -> None:
-        """Follow a stream: moves of ours, and another line."""
+        """Follow our moves in a stream, and the line after them."""
         written = self._written
         if self._wanted is None:
             self._wanted = self._original.wanted()
@@ -266,7 +265,7 @@ class LastCheck:
                 self._take_harmless()
 
     def _takes_line(self, line: bytes, wanted: Wanted) -> bool:
-        """Take a line that is no move of ours, unless the one waited for came before."""
+        """Accept a line that is not a move of ours, unless the awaited one came before."""
         code = line if line == wanted.code else code_of(line)
         if code:
             if self._takes(code, held_back=False):
@@ -290,7 +289,7 @@ class LastCheck:
         return True
 
     def _takes(self, code: bytes, *, held_back: bool) -> bool:
-        """Take a line of a stream for one of the original, if it is one."""
+        """Match a line of a stream to one of the original; return whether there is one."""
         wanted, perhaps = self._wanted, self._original.perhaps
         if (
             wanted is not None
@@ -299,7 +298,7 @@ class LastCheck:
         ):
             compared = wanted.kind is Kind.RESTS and not held_back
             if compared:
-                # Before it too: where E is absolute, what was fed too much comes back with it.
+                # Compare before it too: with absolute E, the line undoes any excess filament.
                 if np.isnan(wanted.before[at.FED] + self._after.state[at.FED]):
                     self._before.state[at.FED] = NAN
                 self._check(wanted.before, at.WITHIN, code, wanted.line, "before")
@@ -328,9 +327,9 @@ class LastCheck:
         return found == at.SAME and wanted.counts_filament(after)
 
     def _take_earlier(self, code: bytes, *, carried_out: bool) -> None:
-        """Take a line for the first with its text that may be there, not for the one waited for.
+        """Match a line to the first possible one with its text instead of the awaited one.
 
-        Filament counts anew from the next line that is compared.
+        Filament is counted anew from the next line that is compared.
         """
         written, perhaps = self._written, self._original.perhaps
         while perhaps.popleft() != code:
@@ -343,7 +342,7 @@ class LastCheck:
         self._kept += 1
 
     def _came_already(self) -> bool:
-        """Whether the line waited for was taken for an earlier one; go on after it then."""
+        """Continue after the awaited line if it was matched to an earlier one; return whether."""
         wanted = self._wanted
         if wanted is None or wanted.code not in self._earlier:
             return False
@@ -354,7 +353,7 @@ class LastCheck:
         return True
 
     def _count_anew(self) -> None:
-        """Count filament anew from the next line that is compared."""
+        """Restart counting filament at the next line that is compared."""
         states = [self._after.state, self._before.state]
         if self._wanted is not None:
             states.append(self._wanted.before)
@@ -363,12 +362,12 @@ class LastCheck:
         self._original.forget_ahead()  # which counts filament from earlier on
 
     def _take(self, wanted: Wanted, *, compared: bool) -> None:
-        """Go on after a line that was waited for."""
+        """Continue after an awaited line."""
         if compared:
             self._count(wanted.line)
         else:
             self._kept += 1
-        # A line that we write too may be ours: lines before the file's own may still come.
+        # We write such lines too: this one may be ours, and the file's own may still come.
         if not (_IN_STREAM.match(wanted.code) or _SHAPER.search(wanted.code)):
             self._original.perhaps.clear()
         self._original.forget_ahead()
@@ -376,7 +375,7 @@ class LastCheck:
         self._begun.append(self._original.place())
 
     def _take_harmless(self) -> None:
-        """Take lines that come next in both files and do nothing to place and modes."""
+        """Skip lines next in both files that change neither position nor modes."""
         written, original = self._written, self._original
         while line := original.harmless():
             if not written.data.startswith(line, written.at):
@@ -400,8 +399,8 @@ class LastCheck:
         if number == ALL:
             self._check(self._before.state, at.WORDS, b"the last stream", original.text.line)
             return
-        # Go back to before the line: what is wanted may lie after it, and lines of ours that set
-        # modes or F may have been taken for such.
+        # Go back to before the line: the awaited one may lie after it, and lines of ours that set
+        # modes or F may have been mistaken for the file's.
         original.look_ahead(wanted)
         original.perhaps.clear()
         while len(self._begun) > 1 and self._begun[-1].line > number:
@@ -419,12 +418,12 @@ class LastCheck:
             )
         self._check(self._before.state, at.WORDS, b"a stream", number)
 
-    # What is found
+    # Comparisons and errors
 
     def _check(
         self, before: NDArray[np.float64], mask: int, code: bytes, line: int, where: str = "after"
     ) -> None:
-        """Compare a state of the original with where the written file is."""
+        """Compare a state of the original with the current state of the written file."""
         if np.isnan(before[at.FED] + self._after.state[at.FED]):
             self._original.forget_ahead()  # which counts filament from earlier on
         found = at.compare(before, self._after.state, mask, self._place_mm, self._filament_mm)
@@ -433,17 +432,17 @@ class LastCheck:
 
     @property
     def _filament_mm(self) -> float:
-        """By how much E may differ: filament, in units of the file."""
+        """Return the tolerance of E in units of the file."""
         return _FILAMENT_MM / self._before.least_flow
 
     def _count(self, line: int) -> None:
-        """Count a line that was compared."""
+        """Count a compared line."""
         before, after = self._before.state, self._after.state
         unknown = before[at.X] + before[at.Y] + after[at.X] + after[at.Y]
         self._note(1, int(unknown != unknown), line, line)
 
     def _note(self, lines: int, unknown: int, line: int, known_line: int) -> None:
-        """Count lines that were compared, from a line on; the place is known from another one."""
+        """Count compared lines from `line` on; the position is known from `known_line` on."""
         self._kept += lines
         self._compared += lines - unknown
         if unknown and not self._gap_line:

@@ -1,4 +1,4 @@
-"""What the last check raises where a written file differs from its original."""
+"""The error raised where a written file differs from its original."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ class LastCheckError(Exception):
     line, written_line : int
         Lines of the original and of the written file, from 1.
     reason : str
-        What was found there.
+        What differs there.
     stream_line : int
-        Line of the original at which the last stream before begins; 0 where there is none.
+        Line of the original at which the preceding stream begins; 0: none.
     """
 
     exit_code = 1
@@ -42,6 +42,6 @@ def _rebuilt(text: str, line: int, written_line: int, reason: str) -> LastCheckE
 
 
 def shown(line: bytes) -> str:
-    """Return a line as a message quotes it, cut if it is long."""
+    """Return a line as quoted in a message, cut if it is long."""
     text = line.strip().decode("utf-8", "replace")
     return text if len(text) <= _LONGEST else text[: _LONGEST - 3] + "..."

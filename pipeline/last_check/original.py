@@ -1,4 +1,4 @@
-"""The original, read along: what comes next, and what must come next in the written file."""
+"""Follow the original: its next lines, and the next that the written file must contain."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from stillpath.pipeline.last_check.reader import Kind, Reader, code_of
 __all__ = ["ALL", "Original", "Place", "Text", "Wanted"]
 
 ALL = 1 << 60
-"""Lines of a file, all of them."""
+"""More lines than any file has."""
 _BLOCK_BYTES = 1 << 18
 _MOST_PERHAPS = 1 << 12
 _AT_A_TIME = 1 << 10
@@ -24,18 +24,18 @@ _BOM = b"\xef\xbb\xbf"
 
 @dataclass(slots=True)
 class Text:
-    """Whole lines of a file that are at hand.
+    """A buffer of whole lines of a file.
 
     Attributes
     ----------
     data, array : bytes, uint8 array
-        The same twice.
+        The same text in two forms.
     at, stop : int
         Where the next line begins, and where the last one ends.
     line : int
         Number of the line at `at`.
     bytes_before : int
-        Where `data` begins in the file.
+        Offset of `data` in the file.
     """
 
     data: bytes = b""
@@ -47,17 +47,17 @@ class Text:
 
     @property
     def is_read(self) -> bool:
-        """Nothing is left."""
+        """Whether the buffer is used up."""
         return self.at >= self.stop
 
     def take(self, data: bytes) -> None:
-        """Go on with other lines, after those that were at hand."""
+        """Replace the buffer by the lines that follow it."""
         self.bytes_before += len(self.data)
         self.data, self.at, self.stop = data, 0, len(data)
         self.array = np.frombuffer(data, np.uint8)
 
     def peek(self) -> tuple[bytes, int]:
-        """Return the next line without its end, and where the one after it begins."""
+        """Return the next line without its newline, and where the one after it begins."""
         end = self.data.index(b"\n", self.at)
         line = self.data[self.at : end]
         if self.line == 1 and line.startswith(_BOM):
@@ -65,7 +65,7 @@ class Text:
         return line, end + 1
 
     def skip(self, next_at: int, lines: int = 1) -> None:
-        """Go on with a line further down."""
+        """Continue at a later line."""
         self.at = next_at
         self.line += lines
 
@@ -78,7 +78,7 @@ class Wanted:
     ----------
     line : int
     code, array : bytes, uint8 array
-        The same twice; empty at the end of the file.
+        The line in two forms; empty at the end of the file.
     kind : Kind
     mask : int
         Words of a plain move (`Reader.carry_out`).
@@ -94,12 +94,12 @@ class Wanted:
     before: NDArray[np.float64] = field(default_factory=lambda: np.zeros(at.SIZE))
 
     def counts_filament(self, state: NDArray[np.float64]) -> bool:
-        """Whether filament fed before it, and in another state, is known."""
+        """Return whether the filament fed is known both before it and in `state`."""
         return self.kind is Kind.RESTS and not np.isnan(self.before[at.FED] + state[at.FED])
 
 
 class Place(NamedTuple):
-    """A place in the original, and what its reader knew there."""
+    """A place in the original with the reader's state there."""
 
     bytes_before: int
     line: int
@@ -112,14 +112,14 @@ class Original:
     Parameters
     ----------
     source : binary file
-        Is read from its beginning, and again where `go_to` goes back.
+        Read from its beginning, and again after `go_to`.
     reader : Reader
 
     Attributes
     ----------
     text : Text
     perhaps : deque of bytes
-        Lines before the wanted one that may or may not move X or Y.
+        Lines before the awaited one that may or may not move X or Y.
     """
 
     def __init__(self, source: BinaryIO, reader: Reader) -> None:
@@ -132,7 +132,7 @@ class Original:
         self._ahead: tuple[Wanted, Place, tuple[bytes, ...]] | None = None
 
     def read_on(self) -> bool:
-        """Read the next lines; tell whether there are any."""
+        """Read the next lines; return whether there are any."""
         parts = []
         while block := self._source.read(_BLOCK_BYTES):
             cut = block.rfind(b"\n") + 1
@@ -150,12 +150,12 @@ class Original:
         return bool(data)
 
     def place(self) -> Place:
-        """Return where the original is."""
+        """Return the current place in the original."""
         text = self.text
         return Place(text.bytes_before + text.at, text.line, self.reader.keep())
 
     def go_to(self, place: Place) -> None:
-        """Go on from a place."""
+        """Continue from a place."""
         text = self.text
         self.reader.restore(place.kept)
         if text.bytes_before <= place.bytes_before < text.bytes_before + len(text.data):
@@ -167,7 +167,7 @@ class Original:
         text.line = place.line
 
     def peek(self) -> bytes:
-        """Return the next line that holds a command; nothing at the end."""
+        """Return the next line with a command; empty at the end."""
         text = self.text
         while not text.is_read or self.read_on():
             line, next_at = text.peek()
@@ -177,17 +177,17 @@ class Original:
         return b""
 
     def skip(self) -> None:
-        """Go on after the next line."""
+        """Skip the next line."""
         self.text.skip(self.text.data.index(b"\n", self.text.at) + 1)
 
     def harmless(self) -> bytes:
-        """Return the next line with its end if it does nothing to place and modes; else nothing."""
+        """Return the next line if it changes neither position nor modes; else nothing."""
         text = self.text
         line = text.data[text.at : text.data.find(b"\n", text.at) + 1]
         return line if self.reader.leaves_alone(line.rstrip()) else b""
 
     def wanted(self) -> Wanted:
-        """Execute what a stream may replace, and the line after it, which must stay."""
+        """Execute moves that a stream may replace; return the line after them, which must stay."""
         if self._ahead is not None:
             wanted, place, perhaps = self._ahead
             if wanted.line >= self.text.line:
@@ -212,18 +212,18 @@ class Original:
         return Wanted()
 
     def look_ahead(self, wanted: Wanted) -> None:
-        """Look ahead to the next line wanted; the original stands after it.
+        """Keep the next awaited line, after which the original stands.
 
         Many streams may end before it, and the file should not be searched again for each.
         """
         self._ahead = wanted, self.place(), tuple(self.perhaps)
 
     def forget_ahead(self) -> None:
-        """Search again."""
+        """Forget the line found ahead."""
         self._ahead = None
 
     def go_up_to(self, line: int) -> None:
-        """Carry out the lines before another one."""
+        """Execute the lines before another one."""
         while (found := self._next(line, deque(maxlen=0)))[0]:
             if found[1] < 0:
                 self.reader.carry_out(found[0])
@@ -242,8 +242,8 @@ class Original:
         Returns
         -------
         (bytes, int)
-            The line after them, to be carried out, and -1; or one that stands still in X and Y and
-            was carried out, with its words. Nothing at the end of the file, and before the line.
+            The line after them, not yet executed, and -1; or an executed one that does not move X
+            and Y, and its words. Empty at the end of the file, and at `before_line`.
         """
         text, reader = self.text, self.reader
         while text.line < before_line:

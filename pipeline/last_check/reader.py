@@ -1,8 +1,8 @@
-"""A small G-code reader: where a file's own coordinates are at each line, and how much was fed.
+"""A small G-code reader that tracks a file's own coordinates and the filament fed.
 
-It knows plain moves, arcs, modes, units and origins. What may do more makes it forget, until the
-file names the next absolute position: not knowing is never an error. Places are the file's own
-coordinates, so that it does not matter where its origin lies.
+It knows plain moves, arcs, modes, units and origins. After any other command that may move the head
+the position is unknown until the file names the next absolute one; an unknown position is never an
+error. Positions are in the file's own coordinates, so that its origin does not matter.
 """
 
 from __future__ import annotations
@@ -42,18 +42,18 @@ _MOST_HARMLESS = 1 << 10
 
 
 class Kind(IntEnum):
-    """What may become of a line in the written file."""
+    """What the written file may make of a line."""
 
     COMMENT = 0
     """No command."""
     STAYS = 1
-    """It must be there."""
+    """It must be in the written file."""
     RESTS = 2
-    """So must this; it is a plain move without X and Y."""
+    """It must be in the written file, and is a plain move without X and Y."""
     MOVES = 3
-    """It moves X or Y: a stream may stand for it."""
+    """It moves X or Y: a stream may replace it."""
     PERHAPS = 4
-    """Nobody knows whether it does."""
+    """It may or may not move X or Y."""
 
 
 class Reader:
@@ -63,14 +63,14 @@ class Reader:
     ----------
     rules : Rules
     shortest_mm : float
-        A move of X and Y that is shorter may be joined with the next one and stay as it is.
+        Shorter moves of X and Y may be merged into the next one, and left unchanged.
 
     Attributes
     ----------
     state : float array
         See `pipeline.last_check._reader_kernels`.
     lost : bytes
-        The last line after which the position was not known.
+        The last line after which the position was unknown.
     """
 
     def __init__(self, rules: Rules, shortest_mm: float = 0.0) -> None:
@@ -81,17 +81,17 @@ class Reader:
         self.state[at.RELATIVE_E] = self._says_relative_e = rules.relative_e
         self.lost = b""
         self.least_flow = 1.0
-        """The smallest flow factor so far (M221): what E says may be many times what is fed."""
+        """The smallest flow factor so far (M221), with which E is scaled to the filament fed."""
         # Never changed in place, so that `keep` need not copy them.
         self._saved: dict[bytes, tuple[float, ...]] = {}
         self._pushed: tuple[tuple[float, ...], ...] = ()
         self._harmless_lines: set[bytes] = set()
         self._in_plane_xy = True
         self._condition = -1
-        """Indentation of the condition under which lines stand; -1: none."""
+        """Indentation of the condition that encloses the lines; -1: none."""
 
     def keep(self) -> tuple[Any, ...]:
-        """Return what `restore` goes back to."""
+        """Return a snapshot for `restore`."""
         return (
             self.state.copy(),
             self._says_relative_e,
@@ -103,7 +103,7 @@ class Reader:
         )
 
     def restore(self, kept: tuple[Any, ...]) -> None:
-        """Go back to where the reader was."""
+        """Restore a snapshot of `keep`."""
         (
             state,
             self._says_relative_e,
@@ -117,20 +117,20 @@ class Reader:
 
     @property
     def knows_arcs(self) -> bool:
-        """Whether arcs in the plane of X and Y are executed here."""
+        """Return whether arcs in the XY plane are executed here."""
         return self._in_plane_xy and len(self.rules.arcs) > 0
 
     def leaves_alone(self, line: bytes) -> bool:
-        """Whether a line was executed before and changes neither place nor modes."""
+        """Return whether a line is known to change neither position nor modes."""
         return line in self._harmless_lines
 
     def carry_out(self, line: bytes) -> tuple[Kind, int]:
-        """Carry out a line that `code_of` says is one, without its end.
+        """Execute a line of `code_of`, without its newline.
 
         Returns
         -------
         (Kind, int)
-            And which of X Y Z E F are its words (bits 0 to 4), of a plain move.
+            The kind, and for a plain move the mask of its words X Y Z E F (bits 0 to 4).
         """
         if line in self._harmless_lines:
             return Kind.STAYS, 0
@@ -144,7 +144,7 @@ class Reader:
         if rules.folds_case:
             code = code.upper()
         elif code[:1].islower():
-            return Kind.STAYS, 0  # an unknown command, passed over
+            return Kind.STAYS, 0  # an unknown command, skipped by the firmware
         cut = _cut(code, rules)
         if cut is None:
             return Kind.STAYS, 0
@@ -154,14 +154,14 @@ class Reader:
         if name == b"M221" and (flow := _FLOW.search(rest)) is not None:
             self.least_flow = min(self.least_flow, max(0.01 * float(flow[1]), 1e-9))
         if name in rules.harmless or name in _TEXT:
-            # Where a line may hold several commands its place matters too.
+            # Where a line may hold several commands, the result depends on its context.
             if not (rules.several or rules.stacks) and len(self._harmless_lines) < _MOST_HARMLESS:
                 self._harmless_lines.add(line)
             return self._harmless(code, name, rest), 0
         return self._command(code, name, rest), 0
 
     def _is_unconditional(self, code: bytes) -> bool:
-        """Whether a line is executed for certain: it does not depend on a condition."""
+        """Return whether a line is executed unconditionally."""
         indent = len(code) - len(code.lstrip(b" \t"))
         if self._condition >= 0 and indent > self._condition:
             return False
@@ -211,7 +211,7 @@ class Reader:
         return Kind.PERHAPS
 
     def _is_plain_arc(self, words: dict[int, float]) -> bool:
-        """Whether an arc ends where its words say: Marlin passes over one of no length."""
+        """Return whether an arc ends where its words say: Marlin skips one of zero length."""
         if not self._in_plane_xy or not words.keys() <= set(b"XYZEFIJR"):
             return False
         turned = any(words.get(letter, 0.0) != 0.0 for letter in b"IJ")
@@ -227,9 +227,9 @@ class Reader:
         return not turned and words[ord("R")] != 0.0 and way_mm > _STILL_MM
 
     def _command(self, code: bytes, name: bytes, rest: bytes) -> Kind:
-        """Carry out a command that changes modes or the place, or forget."""
+        """Execute a command that changes modes or position, or forget the state."""
         rules, state = self.rules, self.state
-        if not name:  # odd: what stands in it may be carried out, or not
+        if not name:  # malformed: it may be executed or not
             return self._forget(code, modes=_FURTHER.search(code) is not None)
         if rules.several and _FURTHER.search(rest):
             return self._forget(code, modes=True)
@@ -282,7 +282,7 @@ class Reader:
         return Kind.STAYS
 
     def _forget(self, code: bytes, *, modes: bool = False) -> Kind:
-        """Know nothing but the modes until the file says it again."""
+        """Forget all but the modes until the file states it again."""
         self.state[[at.X, at.Y, at.Z, at.E, at.FED, at.F]] = NAN
         if modes:
             self.state[at.RELATIVE] = self._says_relative_e = NAN
@@ -304,22 +304,22 @@ class Reader:
         self._settle()
 
     def _settle(self) -> None:
-        """Work out whether E is relative."""
+        """Determine whether E is relative."""
         relative = self._says_relative_e
         if self.rules.relative_rules_extruder and relative != 1.0:
-            relative = float(relative + self.state[at.RELATIVE])  # nan where nobody knows
+            relative = float(relative + self.state[at.RELATIVE])  # nan: unknown
         self.state[at.RELATIVE_E] = relative
 
 
 def code_of(line: bytes) -> bytes:
-    """Return a line without blanks at its end, or nothing if it holds no command.
+    """Return a line without trailing blanks, or nothing if it contains no command.
 
-    Those at its beginning tell whether it stands under a condition (RepRapFirmware).
+    Leading blanks are kept: they show whether it depends on a condition (RepRapFirmware).
     """
     line = line.rstrip()
     code = line.lstrip()
     if code[:1] in (b"", b";", b"*"):
-        return b""  # a sum alone is of no line
+        return b""  # a checksum without a command
     if code[:1] in (b"N", b"n"):
         found = _LINE_NUMBER.match(code.upper())
         if found is not None and code[found.end() : found.end() + 1] in (b"", b";"):
@@ -328,13 +328,13 @@ def code_of(line: bytes) -> bytes:
 
 
 def is_same(code: bytes, expected: bytes) -> bool:
-    """Whether a line is that of the original; the times of M73 are new in the written file."""
+    """Return whether a line equals the original's, apart from the new times of M73."""
     return code == expected or code.lstrip()[:3] == expected.lstrip()[:3] == b"M73"
 
 
 @lru_cache(maxsize=1024)  # slicers repeat themselves
 def _cut(code: bytes, rules: Rules) -> tuple[bytes, bytes] | None:
-    """Cut a command from its words; None: the firmware drops the line. Odd ones have no name."""
+    """Split a line into command and words; None: dropped by the firmware. Malformed: no name."""
     begin = code
     numbered = _LINE_NUMBER.match(code)
     if numbered is not None:
@@ -367,7 +367,7 @@ def _cut(code: bytes, rules: Rules) -> tuple[bytes, bytes] | None:
 
 
 def _plain_words(rest: bytes, rules: Rules) -> dict[int, float] | None:
-    """Return letters and their numbers if nothing is odd: no blanks within, no letter twice."""
+    """Return letters and numbers of well-formed words: no inner blanks, no repeated letter."""
     if _WORDS.fullmatch(rest) is None:
         return None
     if rules.exponents and re.search(rb"[\d.]E", rest):
@@ -378,6 +378,6 @@ def _plain_words(rest: bytes, rules: Rules) -> dict[int, float] | None:
 
 
 def _state_name(rest: bytes) -> bytes:
-    """Return the name of a saved state; nothing for one that is spelled oddly."""
+    """Return the name of a saved state; empty if malformed."""
     found = _STATE_NAME.search(rest)
     return found[1] if found is not None else b"" if b"NAME" in rest else b"DEFAULT"

@@ -1,10 +1,9 @@
-"""What a firmware reads and what it skips, as far as the last check has to know.
+"""What each firmware reads and skips, as far as the last check must know.
 
 Sources: Klipper klippy/gcode.py and klippy/extras/gcode_move.py, 2026-08; Marlin
 Marlin/src/gcode/parser.cpp, queue.cpp and gcode.cpp, bugfix-2.1.x; RepRapFirmware
-src/GCodes/GCodeBuffer/StringParser.cpp and GCodes2.cpp, 3.5. Words that are not certain to leave
-the head where it is are not among the harmless ones: after them nothing is compared until the
-file names a position.
+src/GCodes/GCodeBuffer/StringParser.cpp and GCodes2.cpp, 3.5. Commands that might move the head are
+not listed as harmless: after them nothing is compared until the file names a position.
 """
 
 from __future__ import annotations
@@ -37,15 +36,15 @@ _ARCS = frozenset((b"G2", b"G3"))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rules:
-    """How a firmware reads.
+    """Parsing rules of a firmware.
 
     Attributes
     ----------
     harmless : frozenset of bytes
-        Commands that leave place, modes and F as they are.
+        Commands that change neither position, modes nor F.
     folds_case, leading_zeros : bool
-        ``g1`` is G1; ``G01`` is G1, and G91 ends where its number does: Klipper's name goes on to
-        the next letter.
+        ``g1`` is G1; ``G01`` is G1, and the command ends with its number (Klipper's name extends
+        to the next letter).
     ignores_subcodes : bool
         G90.5 is G90 (Marlin).
     inches : bool
@@ -53,15 +52,15 @@ class Rules:
     arcs : frozenset of bytes
         Commands of arcs.
     positioning_sets_extruder : bool
-        G90 and G91 are of E too (Marlin).
+        G90 and G91 apply to E too (Marlin).
     relative_rules_extruder : bool
         After G91 E is relative whatever M82 said (Klipper).
     divides_extruder : bool
-        An arc gives each of its pieces a part of E, as if that were relative (Klipper).
+        Each segment of an arc gets a part of E, as if that were relative (Klipper).
     bare_set_position : bool
         G92 without words sets all to 0 (Klipper).
     skips_low_feed : bool
-        An F of 0 or less is passed over (Marlin).
+        An F of 0 or less is skipped (Marlin).
     restores : bool
         SAVE_GCODE_STATE and RESTORE_GCODE_STATE (Klipper).
     stacks : bool
@@ -73,9 +72,9 @@ class Rules:
     several : bool
         A line may hold several commands, and conditions (RepRapFirmware).
     longest : int
-        Characters of a command that are surely read.
+        Length of a command up to which it is certainly read.
     relative_e : float
-        1 where E is relative before the file says so, 0 where it is not, nan where who knows.
+        Initial mode of E: 1 relative, 0 absolute, nan unknown.
     """
 
     harmless: frozenset[bytes]
@@ -99,7 +98,7 @@ class Rules:
 
 
 def rules_of(firmware: Firmware) -> Rules:
-    """Return how the firmware of a machine reads."""
+    """Return the parsing rules of a machine's firmware."""
     arcs = _ARCS if firmware.arcs else frozenset()
     if isinstance(firmware, Klipper):
         return Rules(

@@ -1,4 +1,4 @@
-"""The loop that turns measured samples into points of a layer; `layers` gives it names."""
+"""Kernels that turn measured samples into points of a layer, wrapped by `layers`."""
 
 from __future__ import annotations
 
@@ -35,26 +35,26 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 PEN_X, PEN_Y, PREVIOUS_X, PREVIOUS_Y, SPARE, BEND, HEIGHT = range(7)
-"""Where `follow` keeps positions: the last point, the last sample, points that the text read so
-far leaves room for, how far the path has turned since the last point, the height extruded at."""
+"""Indices of the floats of `follow`: last point, last sample, points allowed by the text so far,
+angle turned since the last point, height of extrusion."""
 COUNT, MOVE, SAMPLES, LAYER, LINE = range(5)
-"""Where it keeps numbers: points of the tile, the move under way, samples since the last point,
-the tile's layer (after a return: the one that comes), the line whose bytes were counted last."""
+"""Indices of its integers: points of the tile, current move, samples since the last point, layer of
+the tile (after a return: the next one), last line whose bytes were counted."""
 
 UNKNOWN = 65535
 _MOST = 65534
 _UNITS_PER_MM = 1e4
 _SHORTEST_MM, _LONGEST_MM = 0.2, 5.0
-"""Points along an edge are no nearer to each other, and no further apart."""
+"""Least and largest distance of points along an edge."""
 _CHANGE_MM, _CHANGE_SHARE = 2e-3, 0.5
-"""An error that stays within this, or within this share of its largest value, is one stretch."""
+"""A stretch ends where the error changes by more than both this and this share of its maximum."""
 _SAGITTA_MM, _TURN = 0.02, 0.35
-"""Chords of an arc make one stretch as long as it stays this straight."""
+"""Chords of an arc form one stretch while it stays this straight."""
 _SAME_HEIGHT_MM = 0.04
 
 
 class Samples(NamedTuple):
-    """Measured motion: places, heights, what extrudes, rows of the moves, errors by channel."""
+    """Measured motion: positions, heights, extrusion, rows of the moves, errors by channel."""
 
     xy: Array
     z: Array
@@ -76,7 +76,7 @@ class Columns(NamedTuple):
 
 
 class State(NamedTuple):
-    """How far `follow` has come.
+    """State of `follow` between calls.
 
     Attributes
     ----------
@@ -85,7 +85,7 @@ class State(NamedTuple):
     high, low, recent : ndarray, shape (channels,)
         Largest and smallest error since the last point, and the last one.
     tally : ndarray, shape (2 channels + 1,)
-        Sums of squares, largest values and number of the samples that extrude.
+        Sums of squares and largest values of extruding samples, and their number.
     """
 
     place: Array
@@ -97,7 +97,7 @@ class State(NamedTuple):
 
 
 class Points(NamedTuple):
-    """Points of a tile, and room for more."""
+    """Points of a tile, with spare capacity."""
 
     xyz: NDArray[np.float32]
     line: NDArray[np.uint32]
@@ -117,26 +117,26 @@ def follow(
     state: State,
     points: Points,
 ) -> int:
-    """Add the points of samples to a tile, until it is full or another one begins.
+    """Add the points of samples to a tile until it is full or the next one begins.
 
     Parameters
     ----------
     samples : Samples
-        `row` counts in the moves.
+        `row` is an index into the moves.
     begin : int
-        First sample to look at.
+        First sample to process.
     moves : Columns
     first, until : int
         Number in the file of the first of the moves; moves before `until` end after the samples.
     point_bytes : float
-        What a point costs.
+        Size of a point.
     state : State
     points : Points
 
     Returns
     -------
     int
-        The sample to go on with; -1 when all is done.
+        The sample to continue with; -1 when done.
     """
     xy, z, extruding, row, error = samples
     start, end, line, byte_start, byte_end, layer, _ = moves

@@ -1,4 +1,4 @@
-"""What a command, or its moves, ask for at most, in one pass."""
+"""Kernels for the peak demands of a command or of its moves, each in one pass."""
 
 from __future__ import annotations
 
@@ -45,16 +45,16 @@ def speed_step(
     mean: bool,
     corexy: bool,
 ) -> float:
-    """Return the largest step of a motor's speed from move to move, less what rounding may bring.
+    """Return the largest speed step of a motor between moves, less what rounding may cause.
 
     Parameters
     ----------
     accel_s ... direction
         Columns of `Phases`.
     step_mm : float
-        A move's way may be off by so much, and its speed by that over its duration.
+        Possible error of a move's length; that of its speed is this over its duration.
     mean : bool
-        The mean speed counts, and not that of the cruise.
+        Use the mean speed of a move instead of its cruise speed.
     corexy : bool
         The motors turn with x + y and x - y.
     """

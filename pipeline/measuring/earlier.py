@@ -1,7 +1,7 @@
-"""Errors of the sliced file, at the places of the file as it is advised.
+"""Errors of the sliced file at the places of the advised file.
 
-Both make the same moves at other times. Errors of the first are kept in a file by their place,
-the number of the move and the part of it that is done, and read again at the places of the second.
+Both make the same moves at different times. Errors of the first are stored by place (the number of
+the move plus the fraction of it that is done) and interpolated at the places of the second.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ _ROWS = 1 << 16
 
 
 class EarlierErrors:
-    """Keep errors of some channels along a file.
+    """Store errors of some channels along a file.
 
     Parameters
     ----------
     folder : Path
-        Where the file without a name is kept.
+        Folder of the temporary file.
     channels : int
     """
 
@@ -51,7 +51,7 @@ class EarlierErrors:
         self._file.close()
 
     def note(self, points: MeasuredPoints, error_mm: Array) -> None:
-        """Keep errors (channels, n) at points."""
+        """Store errors (channels, n) at points."""
         place = np.maximum.accumulate(np.append(self._last, _places(points)))[1:]
         if len(place):
             self._last = float(place[-1])

@@ -1,6 +1,6 @@
-"""Layers of a print as files: layers.bin, tiles one after the other, and layers.json about them.
+"""Write the layers of a print: tiles in layers.bin, and their index layers.json.
 
-The format stands in docs/layers.md.
+The format is described in docs/layers.md.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _SCALE_QUANTILE = 0.99
 
 @contextlib.contextmanager
 def written_layers(folder: Path, channels: Sequence[str]) -> Iterator[LayerWriter]:
-    """Yield a writer of layers; both files take their places when the block ends well.
+    """Yield a writer of layers; both files are put in place when the block succeeds.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ def written_layers(folder: Path, channels: Sequence[str]) -> Iterator[LayerWrite
     Raises
     ------
     OSError
-        The folder or the disk does not take them.
+        The folder or disk refuses them.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with (
@@ -97,19 +97,19 @@ class LayerWriter:
             _widen(self._printed, tile, on)
 
     def anew(self) -> LayerWriter:
-        """Discard what is written and return a writer at the beginning."""
+        """Discard what was written and return a fresh writer."""
         for file in (self._tiles, self._index):
             file.seek(0)
             file.truncate()
         return LayerWriter(self._tiles, self._index, self._channels)
 
     def finish(self, features: Sequence[str]) -> None:
-        """Write the figures that only the whole print provides.
+        """Write the figures known only at the end of the print.
 
         Parameters
         ----------
         features : sequence of str
-            Names by the numbers that tiles carry.
+            Names, indexed by the feature numbers in tiles.
         """
         bounds = self._printed if np.all(np.isfinite(self._printed)) else self._all
         known = bounds.round(3).tolist() if np.all(np.isfinite(bounds)) else [0.0] * 4
@@ -121,7 +121,7 @@ class LayerWriter:
         self._index.write("]," + _compact(tail)[1:] + "\n")
 
     def _top(self) -> int:
-        """Error that few points exceed."""
+        """Return an error that few points exceed, for the colour scale."""
         total = np.cumsum(self._seen)
         return int(np.searchsorted(total, _SCALE_QUANTILE * total[-1])) if total[-1] else 0
 

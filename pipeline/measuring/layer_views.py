@@ -1,4 +1,4 @@
-"""Some layers of a print to draw on a page: taken from all of them, thinned as the print grows."""
+"""Choose and thin layers to draw on a page, within bounded memory."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class LayerViews:
         self._layers: dict[int, LayerTile] = {}
 
     def add(self, tile: LayerTile) -> None:
-        """Take a layer, or more of one."""
+        """Add a layer, or more of one."""
         if tile.layer < 0 or tile.layer % self._every:
             return
         part = _thinned(replace(tile, error=np.where(tile.error == UNKNOWN, 0, tile.error)))
@@ -78,9 +78,9 @@ def _joined(first: LayerTile, second: LayerTile) -> LayerTile:
 
 
 def _thinned(tile: LayerTile) -> LayerTile:
-    """Return a tile with a stretch where there were several, and the largest of their errors.
+    """Return a tile in which several stretches are merged, keeping the largest of their errors.
 
-    A stretch is never longer than what extrudes without a break, or travels.
+    A merged stretch never contains both extrusion and travel.
     """
     count = len(tile)
     if count <= _POINTS_PER_LAYER:

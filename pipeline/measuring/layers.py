@@ -1,9 +1,9 @@
-"""The path of every layer with its errors, made while a print is measured.
+"""Record the path of every layer with its errors while a print is measured.
 
 One point for each move of X or Y, and further ones along an edge where the error changes. A
 point's errors are the largest of the stretch that ends there, so that no peak between two corners
-is lost. Points wait in a tile, which goes to whoever takes tiles when its layer ends: memory does
-not grow with the print.
+is lost. Points are collected in a tile, which is passed on when its layer ends: memory does not
+grow with the print.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ __all__ = ["ERROR_UM", "TILE_POINTS", "UNKNOWN", "LayerRecorder", "LayerTile", "
 Array = NDArray[np.float64]
 
 TILE_POINTS = 1 << 17
-"""A layer with more points is several tiles."""
+"""A layer with more points is split into several tiles."""
 _GRANTED = 20_000
-"""Points along edges beyond what the file's own size has room for: small files have long edges."""
+"""Points along edges allowed beyond the file's size: small files have long edges."""
 ERROR_UM = 0.1
 """Unit of a point's errors."""
 UNKNOWN = kernels.UNKNOWN
-"""Error of a point that ends no measured stretch."""
+"""Error of a point that does not end a measured stretch."""
 
 
 def point_bytes(channels: int) -> int:
-    """Return the size of a point: x y line, an error for each channel, feature, on."""
+    """Return the bytes of a point: x y line, an error for each channel, feature, on."""
     return 14 + 2 * channels
 
 
@@ -45,7 +45,7 @@ class LayerTile:
     layer : int
         -1 before the first mark of a layer.
     z_mm : float
-        Median height of what is extruded, or of all points.
+        Median height of the extruding points, or else of all.
     x_mm, y_mm : ndarray of float32, shape (n,)
         Corners of the path. The first point is where it begins.
     line : ndarray of uint32, shape (n,)
@@ -57,9 +57,9 @@ class LayerTile:
     on : ndarray of uint8, shape (n,)
         1 where the stretch extrudes.
     rms_um, max_um : ndarray, shape (channels,)
-        Over the time in which something is extruded.
+        Contour error while extruding.
     seconds : float
-        That time.
+        Extruding time.
     """
 
     layer: int
@@ -87,7 +87,7 @@ class LayerRecorder:
     sample_s : float
         Time from sample to sample.
     takers : sequence of callables
-        Each is given every tile.
+        Each receives every tile.
     """
 
     def __init__(
@@ -144,7 +144,7 @@ class LayerRecorder:
         xy_mm : ndarray, shape (2, n)
             Planned positions.
         z_mm, extruding, row : ndarray, shape (n,)
-            `row` counts in `moves`.
+            `row` is an index into `moves`.
         moves : Moves
         first_move : int
             Number of the first of them in the file.
@@ -164,7 +164,7 @@ class LayerRecorder:
         if begins or jumped:
             self._number[kernels.MOVE] = here
             self._lift(samples)
-        # Numbers go on where one item of the file ends and the next one begins.
+        # Numbers of moves continue from one item of the file to the next.
         self._number[kernels.MOVE] = max(int(self._number[kernels.MOVE]), first_move)
         self._add_points(samples, 0)
 
@@ -196,7 +196,7 @@ class LayerRecorder:
             at = kernels.follow(samples, at, *given)
 
     def _lift(self, samples: kernels.Samples) -> None:
-        """Jump to where samples begin, as the way there is unknown."""
+        """Jump to the first sample: the path to it is unknown."""
         assert self._moves is not None
         row = int(samples.row[0])
         self._place[[kernels.PEN_X, kernels.PEN_Y]] = samples.xy[:, 0]
@@ -210,7 +210,7 @@ class LayerRecorder:
         self._start(float(samples.z[0]), int(self._moves.line[row]))
 
     def _begin(self) -> None:
-        """Begin the tile that the kernel asks for, where the path has come to."""
+        """Begin the next tile at the current end of the path."""
         self._layer = int(self._number[kernels.LAYER])
         self._start(np.nan, int(self._number[kernels.LINE]))
 
@@ -225,7 +225,7 @@ class LayerRecorder:
         self._number[kernels.COUNT] = at + 1
 
     def _close(self) -> None:
-        """Give the tile away, unless it is one point, and clear it."""
+        """Pass the tile on, unless it is a single point, and clear it."""
         count = int(self._number[kernels.COUNT])
         points, tally = self._points, self._state.tally
         if count > 1:
@@ -253,6 +253,6 @@ class LayerRecorder:
 
 
 def _median(z_mm: NDArray[np.float32]) -> float:
-    """Return the median of heights, most often all the same."""
+    """Return the median of heights, which are usually all equal."""
     low = z_mm.min()
     return float(low) if low == z_mm.max() else float(np.median(z_mm))

@@ -1,7 +1,7 @@
-"""The largest contour errors, which a measurement of every sixth sample would miss.
+"""Find the largest contour errors, which a measurement of every sixth sample would miss.
 
-A line that ends at rest, for a retraction say, has not ended for the plastic: the nozzle stands on
-it and rings. Those errors count for the line's maxima, until X or Y moves on or all has died down.
+Where a line ends at rest (for a retraction, say) the nozzle still rings on the soft plastic. Those
+errors count for the line's maxima until X or Y moves on or the vibration has died down.
 
 While something is extruded, a contour error is never above the tracking error, which is known at
 every sample. So a sample whose tracking error is below the largest contour error so far needs no
@@ -22,21 +22,21 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 RINGING_S = 0.1
-"""How long after the end of a line ringing still counts."""
+"""Time after the end of a line in which ringing counts."""
 _STILL_MM = 1e-9
 
 
 class Maxima:
-    """Find the largest errors on lines and after their ends, in all, by layer and by feature.
+    """Find the largest errors on lines and after their ends: overall, by layer and by feature.
 
-    Those of a layer are exact after the ends of its lines only.
+    Those of a layer are exact only after the ends of its lines.
 
     Parameters
     ----------
     dt_s : float
     channels : int
     exact : int, optional
-        The channel whose largest errors on lines are found; None: of none.
+        The channel whose largest errors on lines are found; None: no channel.
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ class Maxima:
     def __init__(self, dt_s: float, channels: int, exact: int | None = None) -> None:
         self._exact = exact
         self._pending = np.zeros((3, 0), np.int64)
-        """Whether the samples that are not answered yet extrude, and their layer and feature."""
+        """Extrusion, layer and feature of the samples without responses yet."""
         self._errors = ChosenMeter(dt_s, channels=channels)
         self._reach = round(RINGING_S / dt_s)
         self._index = np.zeros(0, np.int64)
@@ -66,7 +66,7 @@ class Maxima:
         self._at: Array | None = None
 
     def add(self, samples: MotionSamples) -> None:
-        """Take note of motion whose answers come later."""
+        """Add motion whose responses follow later (`answered`)."""
         n = len(samples)
         path = samples.path_mm
         if self._exact is not None:
@@ -78,7 +78,7 @@ class Maxima:
         here = np.arange(n)
         printed = np.maximum.accumulate(np.where(samples.extruding, here, self._printed))
         moved = np.maximum.accumulate(np.where(moves, here, self._moved))
-        # The last sample of a line may lie a part of a sample before its end.
+        # The last sample of a line may lie just before its end.
         chosen = np.flatnonzero(
             ~samples.extruding & (here - printed <= self._reach) & (moved <= printed + 1)
         )
@@ -96,7 +96,7 @@ class Maxima:
         self._added += n
 
     def answered(self, path_mm: Array, answer_mm: Array) -> None:
-        """Add the next answers, shapes (2, n) and (channels, 2, n), to the samples noted before."""
+        """Add the next responses, shapes (2, n) and (channels, 2, n), to samples added before."""
         upto = self._answered + path_mm.shape[1]
         if self._exact is not None:
             self._choose(np.hypot(*(answer_mm[self._exact] - path_mm)), self._exact)
@@ -106,13 +106,13 @@ class Maxima:
         self._note(self._errors.push(path_mm, answer_mm, at))
 
     def _choose(self, tracking_mm: Array, channel: int) -> None:
-        """Choose samples whose error may exceed their feature's maximum so far."""
+        """Add samples whose error may exceed their feature's maximum so far."""
         n = len(tracking_mm)
         (extruding, *of), self._pending = self._pending[:, :n], self._pending[:, n:]
         chosen = np.zeros(n, np.bool_)
         for feature in np.unique(of[1][extruding > 0]).tolist():
-            most = self.features[feature][channel] if feature in self.features else 0.0
-            chosen |= (of[1] == feature) & (tracking_mm > most)
+            max_mm = self.features[feature][channel] if feature in self.features else 0.0
+            chosen |= (of[1] == feature) & (tracking_mm > max_mm)
         at = np.flatnonzero(chosen & (extruding > 0))
         index = np.append(self._index, self._answered + at)
         order = np.argsort(index, kind="stable")
@@ -130,7 +130,7 @@ class Maxima:
         groups, self._groups = self._groups[:, :count], self._groups[:, count:]
         self._index, self._fed = self._index[count:], self._fed - count
         self.max_mm = np.maximum(self.max_mm, errors_mm.max(axis=1))
-        for of, found in zip(groups, (self.layers, self.features), strict=True):
-            for one in np.unique(of).tolist():
-                most = errors_mm[:, of == one].max(axis=1)
-                found[one] = np.maximum(found[one], most) if one in found else most
+        for of, maxima in zip(groups, (self.layers, self.features), strict=True):
+            for number in np.unique(of).tolist():
+                max_mm = errors_mm[:, of == number].max(axis=1)
+                maxima[number] = np.maximum(maxima[number], max_mm) if number in maxima else max_mm

@@ -1,9 +1,9 @@
-"""Figures of a whole print, summed piece by piece: before, after, and the best shaper.
+"""Measure a whole print piece by piece: as sliced, as compensated, and with the best shaper.
 
-Every channel is the nominal plant's answer to the motion that the firmware executes, measured
-against the same planned path; plants that follow a schedule are those of the moment. Memory stays
-bounded: errors go into tallies, into bins of time that double when they run out, and into tiles of
-layers that are given away.
+Every channel is the nominal plant's response to the motion that the firmware executes, compared
+with the same planned path; scheduled plants are those of the current operating point. Memory is
+bounded: errors go into sums, into time bins that double in width when they run out, and into tiles
+of layers that are passed on.
 """
 
 from __future__ import annotations
@@ -44,12 +44,12 @@ Array = NDArray[np.float64]
 CHANNELS = ("before", "after", "shaper")
 """The measured channels, in the order of all tables."""
 UNCHANGED_CHANNELS = ("before", "shaper")
-"""Those of a file that is not compensated."""
+"""The channels of a file that is not compensated."""
 STRIDE = 6
 """Contour errors are measured at every sixth sample, since they change over tens of samples; maxima
-of the written motion are searched between them, too (`maxima`)."""
+of the written motion are also sought in between (`maxima`)."""
 _SMALL_BYTES = 200_000
-"""Smaller files are measured at every sample: they have too few for chance to even out."""
+"""Smaller files are measured at every sample: they have too few for a fair average."""
 _TRACK_BINS = 400
 
 
@@ -63,17 +63,17 @@ class Measurement:
     shaper : BestShaper
         The reference shaper.
     names : tuple of str
-        Which of `CHANNELS`. Without `after`, `before` is the executed motion: the firmware's own
-        shaper may be in it.
+        Some of `CHANNELS`. Without `after`, `before` is the executed motion, which may include the
+        firmware's own shaper.
     earlier : EarlierErrors, optional
-        Keeps the errors of `before` and `shaper` where they are measured; where `after` is, gives
-        them back for what is shown along the path.
+        Without `after`, stores the errors of `before` and `shaper`; with it, supplies them for what
+        is shown along the path.
     take_layer : callable, optional
-        Is given every layer as soon as it is measured.
+        Receives every layer as soon as it is measured.
     trace : callable, optional
-        Is given the motion. Errors are then measured at every sample.
+        Receives the motion. Errors are then measured at every sample.
     size : int, optional
-        Of the file that is measured, in bytes.
+        Size of the file [bytes].
     """
 
     def __init__(
@@ -133,7 +133,7 @@ class Measurement:
             self._measure(self._answers.push(samples))
 
     def stand(self, samples: int) -> Array | None:
-        """Stand still; return the position for every sample, (2, n), if it is known."""
+        """Stand still; return the position for every sample, (2, n), if known."""
         if self._last is None or samples == 0:
             return None
         last = self._last
@@ -163,7 +163,7 @@ class Measurement:
         self._last = None
 
     def finish(self) -> None:
-        """Finish: the machine rings out where the motion has ended."""
+        """Finish: let the machine ring out at the end of the motion."""
         self.stand(round(RINGING_S / self._dt_s))
         self._measure(self._answers.flush())
         self._note(self._meter.flush())
@@ -258,7 +258,7 @@ class Measurement:
         ends_mm: dict[int, Array],
         label: Callable[[int], tuple[str, str]],
     ) -> list[GroupFigures]:
-        """Return the figures of groups; `label` gives the name and the title of a number."""
+        """Return the figures of groups; `label` maps a number to name and title."""
         tallies = {name: groups.tallies(c) for c, name in enumerate(self._names)}
         out = []
         for key, tally in tallies[self._names[0]].items():
@@ -295,7 +295,7 @@ class Measurement:
         return self._spectra.spectra()
 
     def details(self, names: Sequence[str]) -> dict[str, Any]:
-        """Return the fields of `Result` that go further than channels; `names` are of features."""
+        """Return the other fields of `Result`; `names` are those of features."""
         return {
             "layers": self.layers(),
             "features": self.features(names),
@@ -311,7 +311,7 @@ def _layer_label(number: int) -> tuple[str, str]:
 
 
 class _Bins:
-    """Mean squares over bins of time; two bins become one when there are too many."""
+    """Mean squares in bins of time; pairs of bins are merged when there are too many."""
 
     def __init__(self, channels: int) -> None:
         self.width_s = 1.0
@@ -331,7 +331,7 @@ class _Bins:
             self.width_s *= 2.0
         place = index * (dt_s / self.width_s)
         first, end = int(place[0]), int(place[-1]) + 1
-        # None of these bins is empty: they are much wider than errors are apart.
+        # No bin is empty: bins are much wider than the spacing of errors.
         begins = np.searchsorted(place, np.arange(first, end + 1))
         self._sum[:, first:end] += np.add.reduceat(error_mm**2, begins[:-1], axis=1)
         self._count[first:end] += np.diff(begins)

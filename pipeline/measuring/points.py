@@ -1,4 +1,4 @@
-"""Planned motion sample by sample, and the points of it at which errors are measured."""
+"""Sampled planned motion, and the points of it at which errors are measured."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class MotionSamples:
-    """Planned motion on the sampling grid with what belongs to each sample.
+    """Planned motion on the sampling grid, with the attributes of each sample.
 
     Attributes
     ----------
@@ -30,7 +30,7 @@ class MotionSamples:
     first_move : int
         Number of the first of them in the file.
     sliced_mm : ndarray, shape (2, n), optional
-        X and Y as the firmware executes the sliced file, where that is not as planned.
+        X and Y as the firmware executes the sliced file, if not as planned.
     """
 
     path_mm: Array
@@ -62,7 +62,7 @@ def part_of(samples: MotionSamples, start: int, stop: int) -> MotionSamples:
 
 @dataclass(frozen=True, slots=True)
 class MeasuredPoints:
-    """What belongs to the samples at which contour errors are measured."""
+    """Attributes of the samples at which contour errors are measured."""
 
     path_mm: Array
     z_mm: Array
@@ -74,7 +74,7 @@ class MeasuredPoints:
 
     @classmethod
     def of(cls, samples: MotionSamples, which: slice, *, jumped: bool) -> MeasuredPoints:
-        """Return what belongs to some samples."""
+        """Return the attributes of some samples."""
         return cls(
             samples.path_mm[:, which].copy(),
             samples.z_mm[which].copy(),

@@ -1,13 +1,13 @@
-"""The best of the firmware's own shapers for a machine: the figure to beat.
+"""Tune the best of the firmware's own shapers for a machine: the reference to beat.
 
 Definition: types zv, mzv, ei, 2hump_ei, 3hump_ei with damping 0.1; one frequency an axis on a
 2 % grid from 20 to 200 Hz; the type and pair that minimise the rms contour error over extruding
 motion on the nominal plant.
 
-A shaper and a plant are both linear and share the sampling grid, so they commute: the plant
-answers the plan once, and a shaped answer is a few shifted copies of that, needed only at the
-points that are measured. A coarse grid on few points finds the valleys, a descent on the full
-grid with more points finds their floor, and all points decide between the best.
+Shaper and plant are both linear and share the sampling grid, so they commute: the plant's response
+to the plan is computed once, and a shaped response is a few shifted copies of it, needed only at
+the points that are measured. A coarse grid on few points finds the valleys, a descent on the full
+grid with more points finds their minima, and all points decide between the best.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ Ints = NDArray[np.int64]
 
 _ZETA = 0.1
 _VERSION = 2
-"""Part of the cache's name; rises when the definition changes."""
+"""Part of the cache's file name; increased when the definition changes."""
 _SHIPPED, _SHIPPED_US = Path(__file__).with_name("reference_shapers.json"), 1000
 _COARSE = 4
 _COARSE_POINTS, _FINE_POINTS, _FINAL_POINTS = 1500, 8000, 60_000
@@ -66,7 +66,7 @@ FREQUENCIES_HZ: Array = np.array([20.0 * 1.02**k for k in range(117)])
 class BestShaper:
     """A firmware shaper for both axes and its contour error.
 
-    `contour_rms_um` and `tracking_rms_um` hold over extruding motion on the nominal plant.
+    `contour_rms_um` and `tracking_rms_um` are of extruding motion on the nominal plant.
     """
 
     type: str
@@ -78,12 +78,12 @@ class BestShaper:
 
     @property
     def pulses(self) -> list[tuple[Array, Array]]:
-        """Weights and delays [s] of its pulses, for X and for Y."""
+        """Return weights and delays [s] of the pulses, for X and for Y."""
         return [shaper_pulses(self.type, f_hz, self.zeta) for f_hz in (self.fx_hz, self.fy_hz)]
 
     @property
     def label(self) -> str:
-        """Type and frequencies for a person."""
+        """Type and frequencies as shown to users."""
         return f"{self.type} {self.fx_hz:.1f} / {self.fy_hz:.1f} Hz"
 
 
@@ -158,11 +158,11 @@ def evaluate_shaper(
 def cached_shaper(machine: Machine, directory: Path, dt_s: float = 1e-3) -> BestShaper:
     """Return the best shaper on the reference motion; it is tuned once per set of inputs.
 
-    Where nothing but a resonance was typed in, the shaper is at its frequency: of the type that
-    printer.cfg states, else ZV.
+    Where only a resonance was typed in, the shaper is at its frequency: of the type stated in
+    printer.cfg, else ZV.
 
-    The result is a small JSON file in `directory`, written whole or not at all. A file that
-    cannot be read is made again. For the built-in machines it comes with the program.
+    The result is cached as a JSON file in `directory`; an unreadable file is made again. Results
+    for the built-in machines come with the program.
     """
     stated = [stated_hz(machine.axes[axis]) for axis in ("x", "y")]
     if any(stated):
@@ -204,8 +204,8 @@ def _tuned_shaper(machine: Machine, directory: Path, dt_s: float) -> BestShaper:
     return kept(path, _read, tuned)
 
 
-def _read(found: dict[str, Any]) -> BestShaper:
-    shaper = BestShaper(**found)
+def _read(document: dict[str, Any]) -> BestShaper:
+    shaper = BestShaper(**document)
     if shaper.type not in SHAPERS or min(shaper.fx_hz, shaper.fy_hz) <= 0:
         raise ValueError("no shaper with frequencies")
     return shaper
@@ -249,14 +249,14 @@ class _Trial:
         """Prepare about `count` points spread over the extruding samples; return their key."""
         if count not in self._points:
             step = max(1, len(self._chosen) // count)
-            # A stride that shares no rhythm with the motion: one random sample per cell.
+            # One random sample per cell avoids aliasing with the motion.
             offset = np.random.default_rng(1).integers(0, step, len(self._chosen) // step)
             cells = np.arange(len(offset)) * step + offset
             self._points[count] = self._chosen[cells]
         return count
 
     def rms(self, kind: str, i: int, j: int, points: int) -> float:
-        """Rms contour error [mm] with frequency number i on X and j on Y."""
+        """Return the rms contour error [mm] with frequency index i on X and j on Y."""
         key = (points, kind, i, j)
         if key not in self._known:
             at = self._points[points]
@@ -266,7 +266,7 @@ class _Trial:
         return self._known[key]
 
     def forget(self) -> None:
-        """Drop the shaped answers (they are large and belong to one type of shaper)."""
+        """Drop the shaped responses (they are large and of one shaper type)."""
         self._shaped.clear()
 
     def _axis(self, axis: int, kind: str, number: int, points: int) -> Array:
@@ -279,12 +279,12 @@ class _Trial:
 
 
 def shaped_at(answer: Array, dt_s: float, pulses: tuple[Array, Array], index: Ints) -> Array:
-    """Return `shape(answer)[index]` alone: the answer of a plant to a shaped command.
+    """Return `shape(answer)[index]`: the response of a plant to a shaped command.
 
     Parameters
     ----------
     answer : ndarray, shape (n,)
-        Of the plant to the plan.
+        Response of the plant to the plan.
     index : ndarray of int64, shape (m,)
     """
     weights, delays = pulses
@@ -301,7 +301,7 @@ def shaped_at(answer: Array, dt_s: float, pulses: tuple[Array, Array], index: In
 
 
 def _floors(trial: _Trial, kind: str) -> set[tuple[float, int, int]]:
-    """Return the floors of the deepest valleys of one type: rms on many points, frequencies."""
+    """Return the minima of the deepest valleys of one type: rms on many points, frequencies."""
     coarse, fine = trial.points(_COARSE_POINTS), trial.points(_FINE_POINTS)
     grid = range(0, len(FREQUENCIES_HZ), _COARSE)
     rough = sorted((trial.rms(kind, i, j, coarse), i, j) for i in grid for j in grid)
@@ -317,7 +317,7 @@ def _floors(trial: _Trial, kind: str) -> set[tuple[float, int, int]]:
 def _descend(
     trial: _Trial, kind: str, start: tuple[int, int], points: int
 ) -> tuple[float, int, int]:
-    """Walk downhill over the full grid, looking three steps around."""
+    """Descend on the full grid, searching up to three steps around."""
     i, j = start
     best = trial.rms(kind, i, j, points)
     top = len(FREQUENCIES_HZ) - 1
@@ -337,7 +337,7 @@ def _descend(
 def _with_rests(
     y_d_mm: Array, use: NDArray[np.bool_], dt_s: float
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Add standstill before and after: a centred shaper begins early and ends late."""
+    """Pad with standstill: a centred shaper begins early and ends late."""
     pad = 2 * round(_REST_S / dt_s / 2)
     return np.pad(y_d_mm, ((0, 0), (pad, pad)), mode="edge"), np.pad(use, pad)
 

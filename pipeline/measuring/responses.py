@@ -1,7 +1,7 @@
-"""Responses of a machine to the commands of a print: as sliced, compensated, and best shaper.
+"""Simulate a machine's response to a print as sliced, as compensated, and with the best shaper.
 
-Motion is pushed as it comes and answered some samples later, as a shaper looks ahead; short motion
-waits for more, since between two pieces there are often a few moves only.
+Motion is pushed as it comes; responses follow some samples later, as a shaper looks ahead. Short
+motion is buffered, since there are often only a few moves between two pieces.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class ResponseSamples:
     path_mm, executed_mm : ndarray, shape (2, n)
     extruding : ndarray of bool, shape (n,)
     answer_mm : ndarray, shape (channels, 2, n)
-        Part of a larger array.
+        View of a larger array.
     """
 
     path_mm: Array
@@ -44,14 +44,14 @@ class ResponseSamples:
 
 
 class Responses:
-    """Answers of the nominal plants to the commands of some channels.
+    """Responses of the nominal plants to the commands of some channels.
 
     Parameters
     ----------
     machine : Machine
     dt_s : float
     shaper : BestShaper
-        Its delay is taken out.
+        Its delay is removed.
     names : sequence of str
         Channels: `before` is the sliced file (the executed motion, if nothing is compensated),
         `after` the executed motion, `shaper` the sliced file, shaped.
@@ -71,15 +71,15 @@ class Responses:
         self._reach = 2 + max(int(np.ceil(times[-1] / dt_s)) for _, times in self._pulses)
         # Plants that change do so where the motion has come to.
         self._least = 1 if machine.schedules else _LEAST_SAMPLES
-        # A linear machine's answer to the shaped path is its answer to the path, shaped.
+        # A linear machine's response to a shaped path is its shaped response to the path.
         linear = not machine.schedules and not machine.ripple
         self._shapes_answer = linear and self._compensated and {"before", "shaper"} <= set(names)
         self._streams: dict[str, MachineStream] = {}
         self._planned, self._executed = np.zeros((2, 0)), np.zeros((2, 0))
-        """Planned: the path, and below it the sliced file, where that is not the same."""
+        """Planned: the path, followed by the rows of the sliced file where they differ."""
         self._extruding = np.zeros(0, bool)
         self._answer = np.zeros((2, 0))
-        """To the path, from `reach` samples before what is held to where it is known."""
+        """Response to the path, from `reach` samples before the held motion as far as known."""
 
     def operate_at(self, point: OperatingPoint) -> None:
         """Set the operating point of the motion that follows."""
@@ -93,7 +93,7 @@ class Responses:
         if samples.sliced_mm is not None:
             fresh = np.concatenate([fresh, samples.sliced_mm])
         if self._planned.shape[1] == 0:
-            # The machine stood where it begins.
+            # Before, the machine stood where the motion begins.
             self._planned = np.repeat(fresh[:, :1], self._reach, axis=1)
             self._answer = self._planned[-2:]
             self._stand()

@@ -21,12 +21,12 @@ Ints = NDArray[np.int32]
 Mask = NDArray[np.bool_]
 
 LANDING_S = 0.05
-"""Extrusion this soon after a travel counts for the travel too, which shook the machine."""
+"""Extrusion this soon after a travel also counts for the travel, which excited the machine."""
 
 
 @dataclass(frozen=True, slots=True)
 class ClassError:
-    """Contour error of one class of moves: root mean square of the worst plant, and of how long."""
+    """Contour error of one class of moves: rms of the worst plant, and the time measured."""
 
     rms_um: float
     seconds: float
@@ -64,7 +64,7 @@ class ErrorSum:
 def machine_numbers(machine: Machine, dt_s: float) -> list[int | None]:
     """Return the numbers of the machines of a set: the nominal one (None), and the members.
 
-    Member number k of X and of Y make one machine; the axis with more has some that are left out.
+    Member k of X and member k of Y make one machine; surplus members of an axis are left out.
     """
     sets = [plant_set(machine.axes[axis], dt_s) for axis in ("x", "y")]
     return [None, *range(min(len(one.members) for one in sets))]
@@ -114,10 +114,10 @@ class SetErrors:
         Parameters
         ----------
         path_mm, command_mm : ndarray, shape (2, n)
-            Planned, and what the machine receives.
+            Planned motion, and the command that the machine receives.
         extruding : ndarray of bool, shape (n,)
         classes : ndarray of int32, shape (n,)
-            What the errors of each sample count for while it extrudes.
+            Class that the errors of each extruding sample count for.
         """
         n = path_mm.shape[1]
         if n == 0:
@@ -143,7 +143,7 @@ class SetErrors:
         self._note(self._meter.flush())
 
     def sums(self) -> dict[int, ErrorSum]:
-        """Return the errors by class, as far as they are measured, added up."""
+        """Return the sums of the errors measured so far, by class."""
         step_s = self._stride * self._dt_s
         found: dict[int, ErrorSum] = {}
         for tally in (self._tally, self._landed):
@@ -153,11 +153,11 @@ class SetErrors:
         return found
 
     def errors(self) -> dict[int, ClassError]:
-        """Return the errors by class, as far as they are measured."""
+        """Return the errors measured so far, by class."""
         return {one: found.worst for one, found in self.sums().items()}
 
     def _landing(self, travels: Mask) -> Mask:
-        """Mark the samples soon after a travel."""
+        """Mark the samples soon after a travel move."""
         n = len(travels)
         at = np.where(travels, np.arange(n), -1 - self._since)
         since = np.arange(n) - np.maximum.accumulate(at)

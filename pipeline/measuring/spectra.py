@@ -17,10 +17,10 @@ Array = NDArray[np.float64]
 
 BLOCK = 1024
 _KEPT = 64
-"""Blocks; when there are as many, every second one is dropped, and from then on only every second
-one is taken."""
+"""Largest number of blocks: when reached, every second one is dropped, and from then on only every
+second one is taken."""
 _LEAST_HZ, _BEYOND = 150.0, 1.4
-"""Spectra go up to this, or this many times the highest resonance."""
+"""Spectra extend to this, or to this multiple of the highest resonance."""
 
 
 class ErrorSpectra:
@@ -45,7 +45,7 @@ class ErrorSpectra:
         top_hz = max(_LEAST_HZ, _BEYOND * float(np.max(found, initial=0.0)))
         self._f_hz = f_hz[: int(np.searchsorted(f_hz, top_hz)) + 1]
         self._window = np.hanning(BLOCK + 1)[:-1]
-        # Spectra are taken at the end: of most blocks that are looked at there is no need.
+        # Blocks are transformed at the end, as most of them are dropped.
         self._blocks = np.zeros((_KEPT, len(self._names), 2, BLOCK))
         self._numbers: list[int] = []
         self._every = 1
@@ -79,7 +79,7 @@ class ErrorSpectra:
         """Return the spectra of both axes; none if nothing long enough was printed."""
         if not self._numbers:
             return []
-        # One-sided: what lies at negative frequencies counts as well.
+        # One-sided: includes the power at negative frequencies.
         scale = 2e6 * self._dt_s / float(np.sum(self._window**2))
         powers = [self._power(block) for block in self._blocks[: len(self._numbers)]]
         density = np.sqrt(scale * np.mean(powers, axis=0))

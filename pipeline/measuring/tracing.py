@@ -1,4 +1,4 @@
-"""The measured motion sample by sample, for callers that need all of it."""
+"""Pass on the measured motion sample by sample, for callers that need all of it."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Trace:
 
 
 class Tracer:
-    """Hold the motion until its errors are known."""
+    """Buffer the motion until its errors are known."""
 
     def __init__(self, trace: Callable[[Trace], None]) -> None:
         self._trace = trace
@@ -60,7 +60,7 @@ class Tracer:
             self._simulated = np.concatenate([self._simulated, simulated_mm], axis=2)
 
     def tell(self, points: MeasuredPoints, error_mm: Array) -> None:
-        """Take the errors (channels, n) of the next samples, and give these away."""
+        """Take the errors (channels, n) of the next samples, and pass these on."""
         count = len(points)
         assert self._executed is not None
         executed, simulated = self._executed[:, :count], self._simulated[:, :, :count]

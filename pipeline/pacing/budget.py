@@ -1,10 +1,10 @@
-"""Speed of every class of moves within a budget of contour error.
+"""Choose and control the speed of every class of moves within a budget of contour error.
 
 The paces of classes of moves (features, travel) are chosen on samples from all over the file
-(`pace_search`): as compensated as they will be, with the moves planned for the firmware, and judged
-by the worst plant of the machine's set. While the file is written its errors are measured in the
-same way, and paces follow them, up and down. A file that ends above its budget all the same is
-written once more, with lower paces, and at last with its own.
+(`pace_search`), compensated and planned as they will be, and judged by the worst plant of the
+machine's set. While the file is written its errors are measured in the same way, and paces are
+corrected up and down. A file that still exceeds its budget is written again with lower paces, and
+finally with its own.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ from stillpath.pipeline.result import BudgetClass, BudgetFigures
 __all__ = ["SpeedBudget"]
 
 _SLOWEST = 0.05
-"""Least pace of the shaper, which may have to be slower than the file."""
+"""Lowest pace with the shaper, which may have to be slower than the file."""
 _ABOVE, _FULL, _ROOM = 1.001, 0.97, 0.9
-"""Error over its bound: too large above the first, lower the pace above the second, raise it below
+"""Ratios of error to bound: too large above the first, slow down above the second, speed up below
 the last."""
 _HELPLESS = 0.99
-"""Above this the others slow down for a class that is already at its own pace."""
+"""Above this, other classes slow down for one that is already at its own pace."""
 _SLOWER, _FASTER = 0.9, 1.08
 _FURTHEST = 2.0
 """Highest pace while writing, relative to the one chosen on samples."""
@@ -53,9 +53,9 @@ _GENTLER = (1.0, 0.6, 0.3)
 _SURE_S = 5.0
 """Extruding time after which the error of a class is meaningful."""
 _ATTEMPTS = 4
-"""Most times that a file is written; the last time at its own paces."""
+"""Largest number of times a file is written; the last time at its own paces."""
 _MILDER, _POWER = 0.9, 0.5
-"""The next attempt aims at this part of the bound, if error ~ acceleration^_POWER."""
+"""The next attempt aims at this share of the bound, assuming error ~ acceleration^_POWER."""
 
 
 @dataclass(slots=True)
@@ -65,13 +65,13 @@ class SpeedBudget:
     Attributes
     ----------
     paces : PaceChoice
-        Of the file that is written, at its beginning.
+        Paces at the beginning of the written file.
     shaper_paces : PaceChoice
         With the best firmware shaper instead of the compensation, at the same budget.
     tops : dict
         Highest factor of every class.
     attempt : int
-        How often the file was written before.
+        Number of times the file was written before.
     """
 
     machine: Machine
@@ -83,11 +83,11 @@ class SpeedBudget:
     attempt: int = 0
     _factors: Factors = field(init=False)
     _since: dict[int, ErrorSum] = field(init=False, default_factory=dict)
-    """Errors so far when a class last got another pace."""
+    """Sums of errors when the pace of a class last changed."""
     _shaper_s: float = field(init=False, default=0.0)
-    """How long what was told so far takes with the shaper."""
+    """Time that the moves so far would take with the shaper."""
     _gentler_s: float = field(init=False, default=0.0)
-    """How long the pieces last, as sliced, that no command could follow at their pace."""
+    """Duration, as sliced, of the pieces that no command could follow at their pace."""
 
     def __post_init__(self) -> None:
         self._factors = dict(self.paces.factors)
@@ -106,7 +106,7 @@ class SpeedBudget:
         Parameters
         ----------
         caution : Caution, optional
-            What the command takes of the shaper.
+            Mixture of command and shaper.
 
         Raises
         ------
@@ -127,56 +127,56 @@ class SpeedBudget:
         )
 
     def classes(self, moves: Moves) -> NDArray[np.int32]:
-        """Return the class of every move; `AS_SLICED` of one that stays as it is."""
+        """Return the class of every move; `AS_SLICED` for unchanged ones."""
         return move_classes(moves, self.first_layer)
 
     def paced(self, piece: Piece) -> Iterator[Piece]:
-        """Yield a piece at its new pace, then gentler ones, and at last the piece as sliced.
+        """Yield a piece at its new pace, then at lower ones, and finally as sliced.
 
-        What it would take with the shaper is counted.
+        Its time with the shaper is counted.
         """
         classes = self.classes(piece.moves)
         if self.shaper_paces.reached:
-            slow = paced(piece, classes, paces(self.shaper_paces.factors), self.machine)
-            self._shaper_s += slow.phases.duration_s
+            with_shaper = paced(piece, classes, paces(self.shaper_paces.factors), self.machine)
+            self._shaper_s += with_shaper.phases.duration_s
         for share in _GENTLER:
             factors = {one: factor**share for one, factor in self._factors.items()}
-            quick = paced(piece, classes, paces(factors), self.machine)
-            if quick is piece:
+            faster = paced(piece, classes, paces(factors), self.machine)
+            if faster is piece:
                 break
-            yield quick
+            yield faster
             self._gentler_s += piece.phases.duration_s if share == 1.0 else 0.0
         yield piece
 
     def passed(self, seconds: float) -> None:
-        """Count what stays as sliced."""
+        """Count the time of what stays as sliced."""
         self._shaper_s += seconds
 
     def correct(self, sums: Mapping[int, ErrorSum]) -> None:
-        """Let paces follow the errors so far: down near the bound, up where there is room."""
+        """Correct paces by the errors so far: down near the bound, up where there is room."""
         used = {one: self._used(one, sums[one]) for one in self._factors if one in sums}
-        roomy = max(used.values(), default=0.0) < _FULL
+        has_room = max(used.values(), default=0.0) < _FULL
         for one, factor in sorted(self._factors.items()):
             if one not in used:
                 continue
             new = sums[one] - self._since[one] if one in self._since else sums[one]
             if new.seconds < _SURE_S:
                 continue
-            lately, wanted = self._used(one, new), factor
-            if min(used[one] / _FULL, lately / _ROOM) > 1.0:
-                wanted = max(1.0, _SLOWER * factor)
-                helpless = factor == 1.0 and min(used[one], lately) > _HELPLESS
-                if helpless and self._keeps_budget(one):
+            recent, target = self._used(one, new), factor
+            if min(used[one] / _FULL, recent / _ROOM) > 1.0:
+                target = max(1.0, _SLOWER * factor)
+                at_own_pace = factor == 1.0 and min(used[one], recent) > _HELPLESS
+                if at_own_pace and self._keeps_budget(one):
                     self._slow_others()
                     self._since[one] = sums[one]
-            elif roomy and max(used[one], lately) < _ROOM:
-                most = min(self.tops[one], _FURTHEST * self.paces.factors[one])
-                wanted = max(factor, min(_FASTER * factor, most))
-            if wanted != factor:
-                self._factors[one], self._since[one] = wanted, sums[one]
+            elif has_room and max(used[one], recent) < _ROOM:
+                highest = min(self.tops[one], _FURTHEST * self.paces.factors[one])
+                target = max(factor, min(_FASTER * factor, highest))
+            if target != factor:
+                self._factors[one], self._since[one] = target, sums[one]
 
     def _slow_others(self) -> None:
-        """Slow down what shakes a class that is at its own pace: travel, and then all others."""
+        """Slow down what disturbs a class at its own pace: travel first, then all others."""
         travel_first = self._factors.get(TRAVEL, 1.0) > 1.0
         for one in [TRAVEL] if travel_first else [*self._factors]:
             self._factors[one] = max(1.0, _SLOWER * self._factors[one])
@@ -211,15 +211,15 @@ class SpeedBudget:
         )
 
     def again(self) -> SpeedBudget:
-        """Return the same as it was before anything was written."""
+        """Return this budget as it was before anything was written."""
         return replace(self)
 
     def _keeps_budget(self, one: int) -> bool:
-        """Return whether a class keeps the budget at its own pace, in the samples."""
+        """Return whether a class kept the budget at its own pace in the samples."""
         return self.paces.bounds_um[one] <= allowed_um(one, self.budget_um)
 
     def _used(self, one: int, found: ErrorSum) -> float:
-        """Return the part of its bound that an error of a class is."""
+        """Return the ratio of a class's error to its bound."""
         bound_um = self.paces.bounds_um.get(one, allowed_um(one, self.budget_um))
         return found.worst.rms_um / bound_um
 
@@ -254,7 +254,7 @@ class SpeedBudget:
         )
 
     def warnings(self, sums: Mapping[int, ErrorSum], names: Sequence[str]) -> list[str]:
-        """Return where the budget is not kept, in words."""
+        """Return warnings about classes that exceed the budget."""
         warnings = []
         for one, found in sorted(sums.items()):
             error = found.worst
@@ -281,7 +281,7 @@ class SpeedBudget:
 
 
 def _tops(samples: list[Sample], machine: Machine) -> Factors:
-    """Return the highest pace of every class: that at which its slowest moves are at the limits."""
+    """Return the highest pace of every class, at which its slowest moves reach the limits."""
     most = top_limits(machine)
     tops: Factors = {}
     for sample in samples:

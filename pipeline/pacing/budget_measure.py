@@ -1,7 +1,7 @@
-"""Figures of a print that became faster, beside those of the print as it was sliced.
+"""Measure a print that was made faster, beside the print as sliced.
 
-What is written runs in a time of its own. The errors of the sliced file, and of it with the
-best shaper, are those at the file's own speeds, and are measured there.
+The written file has its own timing. Errors of the sliced file, also with the best shaper, are
+measured at that file's own speeds.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _STRIDE = 24
 
 
 class BudgetMeasurement(Measurement):
-    """Measure both motions; parameters as `Measurement` has them.
+    """Measure both motions; parameters are those of `Measurement`.
 
     Channels, layers and features are those of the written file, with `before` and `shaper` at the
     speeds of the sliced file. What is drawn along the print (track, spectra, tiles of layers)
@@ -74,7 +74,7 @@ class BudgetMeasurement(Measurement):
         ----------
         written, sliced : MotionSamples
         classes : ndarray of int32, shape (len(written.moves),)
-            What the errors of each of `written.moves` count for.
+            Class that the errors of each of `written.moves` count for.
         """
         super().add(written)
         self._sliced.add(sliced)
@@ -113,7 +113,7 @@ class BudgetMeasurement(Measurement):
 
 
 def _joined(written: list[GroupFigures], sliced: list[GroupFigures]) -> list[GroupFigures]:
-    """Put the figures of the sliced file over those at the new speeds."""
+    """Override figures at the new speeds by those of the sliced file."""
     before = {group.name: group for group in sliced}
     joined = []
     for group in written:

@@ -1,8 +1,8 @@
 """Search, on samples, for the fastest paces within a budget of contour error.
 
-All classes are raised together, each as far as its own error leaves room; where that was too much,
-those above the budget come down until all keep it; and from there all are raised again. Classes
-shake each other, so only what was tried counts: of all trials within the budget, the quickest wins.
+All classes are raised together, each as far as its own error leaves room. If that was too much,
+those above the budget come down until all keep it, and from there all are raised again. Classes
+disturb each other, so only trials count: of those within the budget, the fastest wins.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ __all__ = ["PaceChoice", "allowed_um", "search"]
 
 _TRIALS = 10
 _AIM, _WITHIN, _ROOM = 0.95, 0.98, 0.92
-"""Error over its bound: the aim, the largest accepted, and below which a class is raised."""
+"""Ratios of error to bound: the target, the largest accepted, and below which a class is raised."""
 _NO_WORSE = 1.1
-"""A class that exceeds the budget at its own pace may become this many times worse."""
+"""Factor by which a class that exceeds the budget at its own pace may become worse."""
 _LANDING = 2.0
-"""Budgets allowed to extrusion right after a travel; its feature keeps one budget overall."""
+"""Multiple of the budget allowed right after travel; the feature as a whole keeps the budget."""
 _LEAP = 8.0
 """Largest factor by which one step raises a class."""
 _STEEPEST, _FLATTEST = 2.5, 0.2
@@ -31,7 +31,7 @@ _SHAKEN = 0.7
 """The p assumed for the error that a class causes in the classes printed after it."""
 _SAME = 1.02
 _WORTH = 0.002
-"""Share of the time that a raise must save for another one to be tried."""
+"""Share of the time that a raise must save for another to be tried."""
 
 Trial = Callable[[Factors], Tried]
 
@@ -50,9 +50,9 @@ class PaceChoice:
     factors : dict
         Ratios of accelerations by class; 1: as the file has it.
     bounds_um : dict
-        Error that each class may have: the budget, or what it has at its own pace if that is more.
+        Error allowed to each class: the budget, or its error at its own pace if larger.
     reached : bool
-        Some trial kept all bounds.
+        Whether any trial kept all bounds.
     """
 
     factors: Factors
@@ -61,7 +61,7 @@ class PaceChoice:
 
 
 def search(trial: Trial, least: float, most: Factors, budget_um: float) -> PaceChoice:
-    """Find the quickest paces within a budget.
+    """Find the fastest paces within a budget.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ def search(trial: Trial, least: float, most: Factors, budget_um: float) -> PaceC
 
 
 class _Climb:
-    """How far to go up or down, from how errors have followed the paces so far."""
+    """Chooses the next paces from how errors followed those tried so far."""
 
     def __init__(self, least: float, most: Factors) -> None:
         self._least, self._most = least, most
@@ -116,7 +116,7 @@ class _Climb:
         self._last: tuple[Factors, dict[int, float]] | None = None
 
     def learn(self, factors: Factors, over: dict[int, float]) -> None:
-        """Learn from a trial: errors over their bounds by class."""
+        """Learn from a trial; `over` is the ratio of error to bound by class."""
         for one, ratio in over.items():
             if math.isinf(ratio):
                 self._unfit[one] = min(self._unfit[one], factors[one])
@@ -131,7 +131,7 @@ class _Climb:
         self._last = factors, over
 
     def higher(self, factors: Factors, over: dict[int, float]) -> Factors:
-        """Return higher factors for what has room."""
+        """Return higher factors for the classes that have room."""
         wanted = dict(factors)
         for one, factor in factors.items():
             ratio = max(over.get(one, 0.0), 1e-6)
@@ -147,7 +147,7 @@ class _Climb:
         return wanted
 
     def lower(self, factors: Factors, over: dict[int, float], good: Factors) -> Factors:
-        """Return lower factors for what exceeds its bound; `good` are such that keep all."""
+        """Return lower factors for classes above their bounds; `good` are factors that keep all."""
         wanted = dict(factors)
         helpless = 0.0
         for one, ratio in over.items():
@@ -161,7 +161,7 @@ class _Climb:
             else:
                 wanted[one] = self._less(factor, ratio, self._power[one])
         if helpless:
-            # What cannot be slower suffers from what comes before it: travel, and then the others.
+            # A class at its lowest is disturbed by what precedes it: travel first, then the others.
             blamed = [TRAVEL] if factors.get(TRAVEL, 0.0) > good.get(TRAVEL, 0.0) else [*factors]
             for one in blamed:
                 if factors[one] > good[one]:
@@ -171,7 +171,7 @@ class _Climb:
         return wanted
 
     def _less(self, factor: float, ratio: float, power: float) -> float:
-        """Return a lower factor that should bring a ratio to the aim."""
+        """Return a lower factor that should bring a ratio to the target."""
         less = float((_AIM / ratio) ** (1.0 / power))
         return max(factor * min(less, 1.0 / _SAME), self._least)
 

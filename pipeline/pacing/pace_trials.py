@@ -1,4 +1,4 @@
-"""Trials of samples at other paces: their errors and durations."""
+"""Try samples at other paces: their errors and durations."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ _STRIDE = 8
 _SHAPER_REACH_S = 0.16
 
 Factors = dict[int, float]
-"""Class of moves to the ratio of its accelerations to the file's."""
+"""Ratio of accelerations to the file's, by class of moves."""
 Motion = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_], NDArray[np.int32]]
-"""Path and command (2, n), and what is extruded and the class of every sample."""
+"""Path and command (2, n), extrusion flag and class of every sample."""
 
 
 @dataclass(frozen=True, slots=True)
 class Tried:
-    """What the samples showed.
+    """The outcome of a trial.
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ class Tried:
     unfit : set of int
         Classes in samples for which there is no command.
     seconds : float
-        How long all samples take, as planned.
+        Planned duration of all samples.
     """
 
     errors: dict[int, ClassError]
@@ -62,7 +62,7 @@ class _Measured:
 
 
 class PaceTrials:
-    """Try paces on samples; earlier trials are not computed again.
+    """Try paces on samples; results of earlier trials are reused.
 
     Samples for which there is no command at their own pace are left out: they stay as sliced.
 
@@ -71,8 +71,7 @@ class PaceTrials:
     samples : list of Sample
     machine : Machine
     motion : callable
-        What the firmware makes of a sample at its new pace; raises `Unfit` where there is no
-        command.
+        Returns the motion of a sample at its new pace; raises `Unfit` where there is no command.
     """
 
     def __init__(
@@ -88,7 +87,7 @@ class PaceTrials:
         self._used = [k for k, works in enumerate(fit) if works]
 
     def __call__(self, factors: Factors) -> Tried:
-        """Return what comes of these factors; a class that is not named keeps its pace."""
+        """Return the outcome of these factors; a class not listed keeps its pace."""
         total: dict[int, ErrorSum] = {}
         unfit: set[int] = set()
         seconds = 0.0
@@ -128,12 +127,12 @@ class PaceTrials:
 def compensated(
     machine: Machine, options: Options, shaper: BestShaper, caution: Caution | None = None
 ) -> Callable[[Sample, Piece], Motion]:
-    """Return how samples move as they will be written.
+    """Return a function that moves samples as they will be written.
 
     Parameters
     ----------
     caution : Caution, optional
-        What the command takes of the shaper.
+        Mixture of command and shaper.
 
     Raises
     ------
@@ -146,7 +145,7 @@ def compensated(
     def motion(sample: Sample, piece: Piece) -> Motion:
         work.compensator.reset(piece.phases.start_mm[0, :2])
         made = work.compensate(piece, sample.point)
-        # The next one begins with the design that did here, as pieces do.
+        # The next sample starts with the design that worked here, as pieces do.
         work.compensator.commit()
         asked = intended(piece.phases, piece.moves.start_mm, piece.moves.end_mm, step_mm)
         planned, position, row, extruding = as_executed(made, asked, made.encoded.phases)
@@ -156,7 +155,7 @@ def compensated(
 
 
 def shaped(shaper: BestShaper) -> Callable[[Sample, Piece], Motion]:
-    """Return how samples move with the best firmware shaper."""
+    """Return a function that moves samples with the best firmware shaper."""
     pad = round(_SHAPER_REACH_S / DT_S)
 
     def motion(sample: Sample, piece: Piece) -> Motion:
@@ -172,5 +171,5 @@ def shaped(shaper: BestShaper) -> Callable[[Sample, Piece], Motion]:
 
 
 def paces(factors: Mapping[int, float]) -> dict[int, Pace]:
-    """Return the paces of factors: travel that accelerates more slowly still keeps its speed."""
+    """Return the paces of factors; travel keeps its speed even at lower acceleration."""
     return {one: Pace(factor, max(factor, 1.0)) for one, factor in factors.items()}

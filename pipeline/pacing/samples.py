@@ -1,4 +1,4 @@
-"""Some seconds of every class of moves, taken from all over a file.
+"""Take samples of some seconds of every class of moves from all over a file.
 
 Memory is bounded: each class keeps a limited number of samples. When there are more, every second
 one is dropped, and from then on only every second one is taken. The same file gives the same
@@ -30,12 +30,12 @@ _LASTS_S = 4.0
 _TOTAL_S = 120.0
 _FEWEST, _MOST = 3, 12
 _SPREAD = 0.6180339887498949
-"""Golden ratio: where in its piece a sample lies shares no rhythm with the file."""
+"""Golden ratio: spreads samples within pieces without aliasing with the file."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """Some moves of a file and where the machine was then."""
+    """Some moves of a file and their operating point."""
 
     piece: Piece
     classes: NDArray[np.int32]
@@ -95,7 +95,7 @@ def take_samples(
     machine : Machine
     dialect : Dialect
     progress : callable, optional
-        Is given the bytes read so far.
+        Receives the bytes read so far.
     """
     operation = Operation(machine)
     places: dict[tuple[int, int], _Places] = {}
@@ -125,7 +125,7 @@ def _items(
 
 
 def _seen(known: FirstLayer, moves: Moves) -> FirstLayer:
-    """Return what is known of the first layer after these moves."""
+    """Return what is known about the first layer after these moves."""
     below = max(known.below, min(int(np.max(moves.layer, initial=-1)), 1))
     prints = moves.prints & (moves.layer >= 0)
     if np.isfinite(known.z_mm) or not np.any(prints):

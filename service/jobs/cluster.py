@@ -1,16 +1,15 @@
-"""The worker processes: our own (a Dask `LocalCluster`), or those of a scheduler elsewhere.
+"""Run jobs on worker processes: our own (a Dask `LocalCluster`), or those of a remote scheduler.
 
-Dask only runs jobs; which there are, and how they ended, is in the database. What is known of Dask
-and matters here:
+Dask only runs jobs; their list and outcome are in the database. Relevant properties of Dask:
 
-- A task is run again if its worker dies, even one that had finished, as long as somebody holds its
-  future: so futures are dropped when they are done, and a job is claimed in the database.
-- Cancelling a task does not stop one that runs: so workers ask the database.
+- A task is run again if its worker dies, even if it had finished, as long as its future is held:
+  so futures are dropped when they are done, and jobs are claimed in the database.
+- Cancelling a task does not stop a running one: so workers check the database.
 - Workers end when their scheduler does: so `stillpath worker` starts them again.
-- A worker of a `LocalCluster` that is away for longer than ``lost-worker-timeout`` is written off
-  for good: so that is long, and we have it replaced ourselves.
-- Whoever reaches a scheduler can run anything on its workers: so ours listens on loopback only, and
-  one elsewhere belongs into a closed network or behind TLS (``tls://..``, Dask's own settings).
+- A worker of a `LocalCluster` that is away for longer than ``lost-worker-timeout`` is abandoned:
+  so that timeout is long, and we replace workers ourselves.
+- Anyone who can reach a scheduler can run code on its workers: so ours listens on loopback only,
+  and a remote one must be in a closed network or behind TLS (``tls://..``, Dask's own settings).
 """
 
 from __future__ import annotations
@@ -54,13 +53,13 @@ DASK_SETTINGS: dict[str, Any] = {
     "distributed.worker.profile.enabled": False,
     "distributed.worker.preload": ["stillpath.service.jobs.preload"],
     "distributed.worker.multiprocessing-method": METHOD,
-    # They die with us.
+    # They end together with this process.
     "distributed.worker.daemon": True,
-    # `service.environment` knows better.
+    # `service.environment` sets the environment.
     "distributed.nanny.pre-spawn-environ": {},
-    # Jobs compute for minutes without letting the event loop in.
+    # Jobs block the event loop for minutes.
     "distributed.admin.tick.limit": "1h",
-    # Fifty ticks a second, and what they cost, tell nobody anything then.
+    # The default of 50 ticks a second is then useless overhead.
     "distributed.admin.tick.interval": "5s",
     "distributed.admin.tick.cycle": "30s",
     "distributed.admin.system-monitor.interval": "10s",
@@ -72,11 +71,11 @@ DASK_SETTINGS: dict[str, Any] = {
 
 
 class ClusterAway(RuntimeError):
-    """The scheduler does not answer; trying again later may help."""
+    """The scheduler does not respond; a retry may help."""
 
 
 class Cluster:
-    """Workers, once they are connected.
+    """The workers of a service.
 
     Parameters
     ----------
@@ -97,11 +96,11 @@ class Cluster:
 
     @property
     def is_connected(self) -> bool:
-        """Whether jobs can be handed over."""
+        """Whether jobs can be submitted."""
         return self._client is not None and self._client.status == "running"
 
     def connect(self) -> None:
-        """Start the workers, or find the scheduler.
+        """Start the workers, or connect to the scheduler.
 
         Raises
         ------
@@ -137,7 +136,7 @@ class Cluster:
         return slots
 
     def submit(self, job: Job, when_done: Callable[[], object]) -> Future:
-        """Hand a job over; `when_done` is called from another thread when its task is over.
+        """Submit a job; `when_done` is called from another thread when its task has ended.
 
         Raises
         ------
@@ -160,19 +159,19 @@ class Cluster:
         return future
 
     def disconnect(self) -> None:
-        """Let go of the scheduler elsewhere; what runs there goes on."""
+        """Disconnect from a remote scheduler; jobs running there continue."""
         client, self._client = self._client, None
         if client is not None:
-            with contextlib.suppress(Exception):  # it may be dead; nothing is lost with it
+            with contextlib.suppress(Exception):  # it may be dead already
                 client.close(timeout=2)
 
     def close(self) -> None:
-        """Let go of the scheduler, and end our own workers at once, whatever they do."""
+        """Disconnect from the scheduler, and kill our own workers immediately."""
         local, self._local = self._local, None
         if local is not None:
-            # Those that only start belong to it; `workers` would leave them out.
+            # Includes workers that are still starting, unlike `workers`.
             for nanny in list(local._created):
-                # Asked kindly, they would finish their jobs first.
+                # A graceful shutdown would finish their jobs first.
                 _kill(getattr(nanny, "pid", None))
         self.disconnect()
         if local is not None:
@@ -183,7 +182,7 @@ class Cluster:
         from distributed import LocalCluster
 
         return LocalCluster(
-            # `slots` has them started, without waiting: an end of the service would wait too.
+            # `slots` starts them without waiting, which would also delay a shutdown.
             n_workers=0,
             threads_per_worker=1,
             processes=True,
@@ -206,13 +205,13 @@ class Cluster:
 
 
 def prepare_dask() -> None:
-    """Set Dask up for this process; before anything of `distributed` is used."""
+    """Configure Dask for this process, before anything of `distributed` is used."""
     import dask
 
     dask.config.set(DASK_SETTINGS)
     from distributed.utils import get_mp_context  # its import sets up logs
 
-    get_mp_context()  # it chooses once what is loaded beforehand; what is chosen last counts
+    get_mp_context()  # sets its preload list once; set ours afterwards
     loaded_context(*OF_THE_SERVICE)
     quiet_dask()
 
@@ -223,7 +222,7 @@ def runner_name(runner: Runner) -> str:
 
 
 def _start_missing(local: LocalCluster, workers: int) -> None:
-    """Start workers up to a number, also for those that ended for good; does not wait for them."""
+    """Start missing workers, also replacing dead ones, without waiting for them."""
     from distributed.core import Status
 
     def drop() -> None:

@@ -1,4 +1,4 @@
-"""Computations besides compensation: each takes a job's task and writes an answer."""
+"""Computations besides compensation: each takes a job's task and writes its result."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from stillpath.service.jobs.task import Task
 
 __all__ = ["run_computation"]
 
-# What is imported in the functions takes a second, which the API need not wait for.
+# Imports inside the functions take a second, for which the API need not wait.
 
 
 def run_computation(task: Task, progress: ProgressCallback) -> dict[str, Any]:
-    """Write what the task asks for to its target; a `service.jobs.task.Runner`.
+    """Write the result of a task to its target; a `service.jobs.task.Runner`.
 
     Raises
     ------
@@ -101,7 +101,7 @@ def _list_loops(task: Task, progress: ProgressCallback) -> None:
 
 
 def _export_live(task: Task, progress: ProgressCallback) -> None:
-    """Write what `stillpath klipper export` writes."""
+    """Write the output of `stillpath klipper export`."""
     from stillpath.applications.live.export import write_export
 
     progress_to(progress, "designing", 0.0)(0.0)

@@ -1,4 +1,4 @@
-"""Imports of `service.jobs.computations`, loaded once so that no computation begins with them."""
+"""Imports of `service.jobs.computations`, loaded once for all forked workers."""
 
 from __future__ import annotations
 
@@ -9,4 +9,4 @@ import stillpath.applications.controllers.page
 import stillpath.applications.design.design
 import stillpath.applications.identification.run  # noqa: F401
 
-gc.freeze()  # so that the copies' collectors leave alone what they share
+gc.freeze()  # keeps the garbage collectors of forks from touching shared memory

@@ -1,4 +1,4 @@
-"""The processes of a service on several computers: the scheduler, and the workers."""
+"""Processes of a service on several computers: scheduler and workers."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _CLOSE_S = 10.0
 def run_scheduler(host: str, port: int) -> None:
     """Run a Dask scheduler until SIGINT or SIGTERM.
 
-    It keeps nothing that the database does not know, so it may be killed and started again.
+    It has no state that is not in the database, so it may be killed and restarted.
 
     Raises
     ------
@@ -51,8 +51,8 @@ def run_scheduler(host: str, port: int) -> None:
 def run_workers(settings: Settings) -> None:
     """Run `settings.workers` worker processes until SIGINT or SIGTERM.
 
-    They wait for the scheduler, and start again when it does. Jobs that run at the end go back to
-    the queue.
+    They wait for the scheduler, and restart when it does. Jobs running at the end go back to the
+    queue.
     """
     prepare_dask()
     if settings.scheduler is None:
@@ -114,7 +114,7 @@ async def _one_life(nanny: object, stopped: asyncio.Event) -> None:
 
 @contextlib.contextmanager
 def _stop_signal() -> Iterator[asyncio.Event]:
-    """Give an event that SIGINT and SIGTERM set."""
+    """Yield an event that SIGINT and SIGTERM set."""
     stopped = asyncio.Event()
     loop = asyncio.get_running_loop()
     with contextlib.ExitStack() as stack:

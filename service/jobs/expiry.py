@@ -1,9 +1,8 @@
-"""Expiry of what has been kept long enough, measured in time that the service was seen to run.
+"""Expiry of jobs and idempotency keys, measured in running time of the service.
 
-Clocks are set, stand still and jump: a computer without a battery begins in 1970. So how long
-something has been kept is counted by the sweep itself, with a clock that only runs (the system's
-monotonic one), and the sum is kept in the database. Time while no service runs does not count: what
-expires, expires late rather than early.
+System clocks jump: a computer without a battery begins in 1970. Ages are therefore counted by the
+sweep itself with the monotonic clock, and the sum is kept in the database. Time while no service
+runs does not count, so expiry is late rather than early.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ _NAME = "sweep"
 
 
 class Expiry:
-    """The age of jobs that are over, and of idempotency keys.
+    """The age of finished jobs and of idempotency keys.
 
     Parameters
     ----------
@@ -38,7 +37,7 @@ class Expiry:
         self._engine = engine
 
     def passed(self, seconds: float) -> float:
-        """Count time that has passed; return all that ever did. What is new is kept from now on."""
+        """Add elapsed time; return the total. New entries start at this total."""
         seen, jobs, submissions = tables.seen_time, tables.jobs, tables.submissions
         with writing(self._engine) as connection:
             statement = insert(connection, seen).values(name=_NAME, seconds=seconds)
@@ -59,9 +58,9 @@ class Expiry:
         return now
 
     def old_jobs(self, before: float, answers_before: float | None = None) -> list[str]:
-        """Return ids of the jobs that were over by a time, as `passed` counts it; oldest first.
+        """Return ids of jobs that had finished by a time, as counted by `passed`; oldest first.
 
-        `answers_before` is the time for jobs that are no compensations, if it is another one.
+        `answers_before` is the time for jobs other than compensations, if different.
         """
         row = tables.jobs.c
         is_old = row.kept_from_s < before
@@ -73,7 +72,7 @@ class Expiry:
             return list(connection.execute(query.order_by(row.kept_from_s, row.id)).scalars())
 
     def forget_submissions(self, before: float) -> int:
-        """Drop the idempotency keys that were there by a time; return how many."""
+        """Delete idempotency keys older than a time; return their number."""
         row = tables.submissions.c
         with writing(self._engine) as connection:
             result: CursorResult[Any] = connection.execute(

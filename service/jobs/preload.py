@@ -17,9 +17,9 @@ async def dask_setup(worker: Any) -> None:
     """Set up a worker process; Dask calls it by this name."""
     quiet_dask()
     if hasattr(os, "nice"):
-        # Whoever hands a file in, and a firmware's host on the same computer, comes first.
+        # Uploads, and a firmware's host on the same computer, take precedence.
         os.nice(_NICENESS)
-    # Ctrl-C goes to the whole terminal group; the service ends its workers itself.
+    # Ctrl-C reaches the whole process group; the service ends its workers itself.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if not hasattr(signal, "SIGKILL"):
         return  # Windows
@@ -27,14 +27,14 @@ async def dask_setup(worker: Any) -> None:
     closing: set[asyncio.Task[Any]] = set()
 
     def close() -> None:
-        # The job goes back to the queue: its watch sees that the worker closes.
+        # The job goes back to the queue: its watch notices that the worker closes.
         closing.add(loop.create_task(worker.close(timeout=5, reason="SIGTERM")))
 
-    # Supervisors send it to all processes at once.
+    # Supervisors send SIGTERM to all processes at once.
     loop.add_signal_handler(signal.SIGTERM, close)
 
 
 def quiet_dask() -> None:
-    """Silence Dask's own logs; what of it matters for a job is said with the job's name."""
+    """Silence Dask's own logs; relevant events are logged with the job's id."""
     for name in ("distributed", "distributed.client", "tornado", "tornado.application"):
         logging.getLogger(name).setLevel(logging.CRITICAL)

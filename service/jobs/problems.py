@@ -26,7 +26,7 @@ _REFUSED = {
     JobKind.CONTROLLER: "Controller not possible",
     JobKind.LIVE: "Live printing not available",
 }
-"""Titles, where what was asked cannot be computed."""
+"""Titles of requests that cannot be computed."""
 
 
 def problem(status: int, title: str, detail: str, **extra: Any) -> dict[str, Any]:
@@ -49,9 +49,9 @@ def problem(status: int, title: str, detail: str, **extra: Any) -> dict[str, Any
 def problem_of(error: BaseException, kind: JobKind = JobKind.COMPENSATION) -> dict[str, Any]:
     """Return the problem document for an error of a job's work.
 
-    The three error roots of the house are the input's fault (422) and are told in full, as is a
-    written file that the last check refuses (500); anything else is ours, and the details stay in
-    the log.
+    The three base errors of the program are the input's fault (422) and are reported in full, as is
+    a written file that the last check refuses (500); anything else is our fault, and its details
+    are only logged.
     """
     from stillpath.compensation.base import DesignError
     from stillpath.gcode.errors import GcodeError
@@ -125,7 +125,7 @@ def storage_never_fits(room_bytes: int, total_bytes: int) -> dict[str, Any]:
 
 
 def storage_away(error: Exception) -> dict[str, Any]:
-    """Return the problem of a job whose files could not be fetched or put away, again and again."""
+    """Return the problem of a job whose files repeatedly could not be fetched or stored."""
     return problem(
         503,
         "Storage unavailable",

@@ -1,4 +1,4 @@
-"""The order in which waiting jobs are dispatched: owners take turns, short jobs apart."""
+"""The dispatch order of waiting jobs: owners take turns, short jobs have their own queue."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ _SHORT = tuple(kind.value for kind in JobKind if kind.is_short)
 def queue_order() -> Subquery:
     """Return id and place, from 1, of every waiting job in the order of dispatch.
 
-    Short jobs stand in a line of their own.
+    Short jobs have a separate queue.
     """
     is_short = case((_JOBS.kind.in_(_SHORT), 1), else_=0).label("is_short")
-    # Of one owner, what is asked about a job that is done comes before further files.
+    # For one owner, requests about finished jobs come before further files.
     is_file = case((_JOBS.kind == "compensation", 1), else_=0).label("is_file")
     present = (
         select(

@@ -1,7 +1,7 @@
-"""Makes the workers follow the database: dispatches jobs, and notices lost ones.
+"""Make the workers follow the database: dispatch jobs, and detect lost ones.
 
-One thread of each process of the API. Of several, the one with the lease acts; it keeps nothing
-that could not be found out again, so any other can go on in its place.
+One thread of each API process. Of several, the one that holds the lease acts; all its state can be
+reconstructed, so any other can take over.
 """
 
 from __future__ import annotations
@@ -29,26 +29,26 @@ if TYPE_CHECKING:
 __all__ = ["Reconciler"]
 
 _LEASE, _LEASE_S, _RENEW_S = "reconciler", 5.0, 2.0
-"""A lease is renewed when it is older: every write waits for the disk, as uploads do."""
+"""A lease is renewed when older than the last: every write waits for the disk, like uploads."""
 _TICK_S = 0.5
 _SWEEP_EVERY_S = 60.0
 _MOST_REMEMBERED = 10_000
 _GIVE_BACK_S = 1.5
-"""How long a worker that closes may take to give its job back; it looks twice a second."""
+"""Time for a closing worker to give its job back; it checks twice a second."""
 _RETRY_S, _LONGEST_RETRY_S = 0.5, 5.0
 _NO_ROOM_S = 30.0
-"""How long a job whose files had no room is left alone: others may need less."""
+"""Delay before a job whose files had no room is retried: others may need less."""
 _ROUNDING_BYTES = 1 << 20
-"""Disks give room in blocks; names need some too."""
+"""Margin for disk blocks and directory entries."""
 _CLOCK_SET_S = 1.0
-"""Between two looks, a clock that was set differs by more."""
+"""Difference between two checks that shows that the clock was set."""
 _OWN_GRACE_S, _GRACE_S = 60.0, 5.0
-"""How long our own workers, which start anew by themselves, and those elsewhere may be away before
+"""Time for which our own workers, which restart by themselves, and remote ones may be away before
 the service is not ready."""
 
 
 class Reconciler:
-    """The thread.
+    """The reconciler thread.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ class Reconciler:
     Attributes
     ----------
     slots : int
-        How many jobs can run at once, as far as is known.
+        Number of jobs that can run at once, as far as known.
     """
 
     def __init__(
@@ -79,19 +79,19 @@ class Reconciler:
         self._log = structlog.get_logger("reconciler")
         self._disk = Disk(settings.data_dir, settings.disk_reserve_bytes)
         self._has_room = True
-        # Which attempt of a job had no room, and when to try again.
+        # Attempt of a job that had no room, and time of the next try.
         self._no_room: dict[str, tuple[int, float]] = {}
         self._in_flight: dict[str, tuple[Job, Future]] = {}
         self._broken_since: dict[str, float] = {}
         self._has_lease = False
         self._leased_at = 0.0
-        # Places without a job after the last look; None while one is under way.
+        # Free slots after the last check; None during one.
         self._free: int | None = None
         self._took_over = False
         self._sweep = Sweep(settings, store, storage)
         self._trouble: str | None = None
         self._trouble_since = 0.0
-        # Since when the database and the workers answer, without a break.
+        # Since when database and workers have responded without interruption.
         self._steady_since = time.monotonic()
         self._clock_offset_s = time.time() - time.monotonic()
 
@@ -109,7 +109,7 @@ class Reconciler:
         self._sweeper.join()
 
     def leave(self) -> None:
-        """Give the jobs of our own workers, which have ended, back to the queue."""
+        """Return the jobs of our own, ended workers to the queue."""
         with contextlib.suppress(DatabaseAway):
             if self._cluster.is_own:
                 for job, _ in self._in_flight.values():
@@ -118,18 +118,18 @@ class Reconciler:
         self._forget()
 
     def notify(self) -> None:
-        """Look at once if a job could be started: there is a new one.
+        """Wake the thread for a new job, if a slot is free.
 
-        Where no place is free, whatever frees one wakes the thread; so nothing is missed.
+        If none is, the thread is woken when one becomes free.
         """
         if self._free != 0:
             self._wake.set()
 
     @property
     def trouble(self) -> str | None:
-        """Why no job would be done now, or None.
+        """Return why jobs cannot be done now, or None.
 
-        Workers that start are none: what is submitted meanwhile is kept and done.
+        Starting workers are no reason: jobs submitted meanwhile are kept and done.
         """
         grace_s = _OWN_GRACE_S if self._cluster.is_own else _GRACE_S
         lasted_s = time.monotonic() - self._trouble_since
@@ -145,13 +145,13 @@ class Reconciler:
             except (DatabaseAway, ClusterAway) as error:
                 self._say(str(error))
                 if isinstance(error, DatabaseAway) and self._disk.is_full:
-                    self._disk.give_up()  # jobs wait; what became of them can be written down
+                    self._disk.give_up()  # jobs wait; the reserve lets their states be written
                 self.slots = 0
                 if isinstance(error, ClusterAway):
                     self._forget()
                     self._cluster.disconnect()
                 self._stopping.wait(wait_s)
-                # From the next try on; it may be the first that works for a long time.
+                # Count from the next try, which may be the first to work for a long time.
                 self._steady_since = time.monotonic()
                 wait_s = min(2 * wait_s, _LONGEST_RETRY_S)
             except Exception:
@@ -170,20 +170,20 @@ class Reconciler:
             self._forget()
             self._cluster.connect()
             if self._stopping.is_set():
-                return  # it took its time; start no workers that must end at once
+                return  # connecting may take long; do not start workers during a shutdown
         self.slots = self._cluster.slots()
         self._say(None if self.slots else "no worker is connected to the scheduler")
         self._renew()
         if not self._has_lease:
             self._free = 0
-            self._forget()  # whoever has the lease hands them over again
+            self._forget()  # the holder of the lease submits them again
             return
         self._find_silent()
         self._collect()
         self._hand_over()
 
     def _forget(self) -> None:
-        """Forget what was handed over, and since when any of it is broken."""
+        """Forget the submitted jobs and the state of troubles."""
         self._in_flight.clear()
         self._broken_since.clear()
 
@@ -195,10 +195,10 @@ class Reconciler:
             self._leased_at = now
 
     def _take_over(self) -> None:
-        """Give back what ran when the service before us ended; its workers ended with it.
+        """Requeue what ran when the previous service ended, together with its workers.
 
-        Only with a database that no other service uses (`service.instance_lock` keeps the folder);
-        otherwise silence tells.
+        Only if no other service uses the database (`service.instance_lock` guards the folder);
+        otherwise lost jobs are detected by silence.
         """
         if self._store.engine.dialect.name == "sqlite":
             for job in self._store.in_state(JobState.RUNNING):
@@ -209,18 +209,18 @@ class Reconciler:
         timeout_s = self._settings.heartbeat_timeout_s
         offset_s = time.time() - time.monotonic()
         if abs(offset_s - self._clock_offset_s) > _CLOCK_SET_S:
-            self._steady_since = time.monotonic()  # what was heard before has an old time
+            self._steady_since = time.monotonic()  # earlier heartbeats have times of the old clock
         self._clock_offset_s = offset_s
-        # While nobody could reach the database, nobody could be heard.
+        # Heartbeats could not arrive while the database was unreachable.
         if time.monotonic() - self._steady_since > timeout_s:
             for job in self._store.silent(time.time() - timeout_s):
                 reason = f"nothing was heard of its worker {job.worker} for {timeout_s:g} s"
                 self._give_back(job.id, job.attempt, reason)
 
     def _collect(self) -> None:
-        """Drop the futures that are done; a job that still runs then has lost its worker.
+        """Drop finished futures; a job that is still running then has lost its worker.
 
-        Dask hears that a worker closes before the worker could give its job back: a moment's grace.
+        A short grace period lets a closing worker give its job back.
         """
         now = time.monotonic()
         done = {
@@ -247,18 +247,18 @@ class Reconciler:
             del self._in_flight[job_id]
             self._broken_since.pop(job_id, None)
         if unclaimed:
-            self._stopping.wait(_RETRY_S)  # whatever it is, do not try it a thousand times
+            self._stopping.wait(_RETRY_S)  # avoid a busy loop, whatever the reason
 
     def _hand_over(self) -> None:
-        """Hand over as many jobs as there are free workers.
+        """Submit as many jobs as there are free workers.
 
-        No more: one that waits at Dask would not see that a more urgent one has come.
+        Not more: a job already waiting at Dask could not be overtaken by a more urgent one.
         """
         busy = {job.id: job for job in self._store.in_state(JobState.RUNNING)}
         busy |= {job_id: job for job_id, (job, _) in self._in_flight.items()}
         free = self.slots - len(busy)
         if free > 0 and self._is_room():
-            # Short jobs may have any place; some are kept for them alone.
+            # Short jobs may use any slot; some slots are reserved for them.
             long = sum(not job.kind.is_short for job in busy.values())
             kept = min(self._settings.computing_processes, self.slots - 1)
             free -= self._begin(free, short=True)
@@ -266,7 +266,7 @@ class Reconciler:
         self._free = max(free, 0)
 
     def _begin(self, most: int, *, short: bool) -> int:
-        """Hand over up to so many jobs; return how many there were."""
+        """Submit at most `most` jobs; return their number."""
         if most <= 0:
             return 0
         now, begun = time.monotonic(), 0
@@ -280,7 +280,7 @@ class Reconciler:
         return begun
 
     def _is_room(self) -> bool:
-        """Return whether jobs may begin; the workers of other computers look for themselves."""
+        """Return whether there is room for jobs; workers on other computers check themselves."""
         has_room = not self._cluster.is_own or self._disk.lets_jobs_begin
         if has_room != self._has_room:
             self._has_room = has_room
@@ -292,9 +292,9 @@ class Reconciler:
         return has_room
 
     def _may_try_again(self, job: Job, now: float) -> bool:
-        """Return whether a job whose files had no room has been left alone for long enough.
+        """Return whether a job whose files had no room may be tried again.
 
-        Our own workers' disk is seen from here: the job then waits until there is what it needs.
+        With our own workers, whose disk is known here, it waits until there is enough room.
         """
         attempt, until = self._no_room.get(job.id, (-1, 0.0))
         if attempt == job.attempt and until > now:
@@ -310,7 +310,7 @@ class Reconciler:
     def _has_room_for(self, more_bytes: int) -> bool:
         """Return whether a job has room, on our disk and on that of the storage."""
         room = None
-        with contextlib.suppress(StorageError):  # its workers find out
+        with contextlib.suppress(StorageError):  # the workers will notice
             room = self._storage.room()
         stored = room is None or room.free_bytes >= more_bytes + _ROUNDING_BYTES
         return stored and self._disk.has_room_for(more_bytes)
@@ -331,7 +331,7 @@ class Reconciler:
             self._log.warning("no jobs are done", reason=trouble)
         self._trouble = trouble
 
-    # The other thread: what may take long
+    # The second thread, for slow work
 
     def _run_sweeps(self) -> None:
         while True:

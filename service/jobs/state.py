@@ -12,8 +12,8 @@
      +---------------------------+----------------------------------> CANCELLED
                   cancelled
 
-A job may be deleted in every state. `attempt` is a fence: what a worker reports counts only for
-the attempt it was given, and only while that runs. That is also how a worker learns of a cancel.
+A job may be deleted in every state. `attempt` is a fencing token: a worker's report counts only for
+its own attempt, and only while that runs. This is also how a worker learns of a cancellation.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ __all__ = [
 ]
 
 WAITING_FOR_ROOM = "waiting for room on the disk"
-"""Stage of a job that went back to the queue because its files had no room."""
+"""Stage of a requeued job whose files had no room."""
 
 
 class JobKind(StrEnum):
@@ -56,7 +56,7 @@ class JobKind(StrEnum):
 
     @property
     def is_short(self) -> bool:
-        """Whether it is over within minutes: it does not queue behind what takes hours."""
+        """Whether it takes minutes at most, so that it does not queue behind long jobs."""
         return self not in (JobKind.COMPENSATION, JobKind.TRAJECTORIES)
 
 
@@ -71,29 +71,29 @@ class JobState(StrEnum):
 
     @property
     def is_final(self) -> bool:
-        """Whether nothing more will happen."""
+        """Whether the state is final."""
         return self not in (JobState.QUEUED, JobState.RUNNING)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Job:
-    """One job as the store remembers it; the fields are the columns of the table `jobs`.
+    """One job as stored; the fields are the columns of the table `jobs`.
 
     Attributes
     ----------
     id : str
     kind : JobKind
-        Compensations have a caller's file and a report; of the others only the answer counts.
+        Compensations have an uploaded file and a report; other kinds only a result.
     owner : str
         Whose job it is.
     batch : str or None
-        What several jobs have in common, chosen by their owner.
+        Label of a group of jobs, chosen by their owner.
     machine, machine_revision : str
-        Name of a machine, and which state of it; the document is kept with the job's files.
+        Name and revision of a machine; the document is kept with the job's files.
     options : dict
-        The fields of `pipeline.options.Options`; of other kinds, what was asked.
+        The fields of `pipeline.options.Options`; for other kinds, the request.
     dedupe_key : str
-        Equal for jobs that must have the same result: of input, machine, options and version.
+        Digest of input, machine, options and version: equal jobs have the same result.
     priority : int
         Higher ones go first.
     source_name, result_name : str
@@ -107,19 +107,19 @@ class Job:
     summary : dict or None
         The figures that lists show.
     attempt : int
-        How often the job was started; it only grows, so it is the fence for reports.
+        Number of starts; it only grows, so it serves as fencing token.
     losses : int
-        How often its worker died with it.
+        Number of times its worker died.
     worker : str or None
         Who runs it, or ran it last.
     stage, progress, eta_s : str, float, float or None
-        What the worker does, how much of the job is done (0 to 1), and how long it will take.
+        Current stage, share done (0 to 1), and estimated remaining time.
     problem : dict or None
         Why the job failed, as a problem document (RFC 9457).
     created_at, started_at, heartbeat_at, finished_at : float or None
         Seconds since the epoch. `heartbeat_at`: when the worker was last heard of.
     room_bytes : int or None
-        Room on the disk that it needs at least, if there was too little once.
+        Disk space that it needs at least, if there was too little before.
     webhook : str or None
         Address that is notified when the job ends.
     printer, print_after : str or None, bool
@@ -163,7 +163,7 @@ class Job:
 
     @property
     def sources(self) -> list[str]:
-        """Where its input lies in the storage."""
+        """Keys of its input in the storage."""
         match self.kind:
             case JobKind.COMPENSATION | JobKind.TRAJECTORIES:
                 return [f"{self._origin}/source/{self.source_name}"]
@@ -174,27 +174,27 @@ class Job:
 
     @property
     def machine_file(self) -> str:
-        """Where its machine lies in the storage, if it has one."""
+        """Key of its machine in the storage, if it has one."""
         return f"{self._origin}/machine.json"
 
     @property
     def result(self) -> str:
-        """Where its result lies in the storage, once it is done."""
+        """Key of its result in the storage, once it is done."""
         return f"{self.output}/result/{self.result_name}"
 
     @property
     def files(self) -> str:
-        """Prefix in the storage under which all its files lie."""
+        """Prefix of all its files in the storage."""
         return f"jobs/{self.id}/"
 
     @property
     def attempt_files(self) -> str:
-        """The part of them that the attempt under way puts there, or has put."""
+        """Prefix of the files of the current or last attempt."""
         return f"jobs/{self.id}/{self.attempt}"
 
     @property
     def waits_for_room(self) -> bool:
-        """Whether it would run if the disk had more room."""
+        """Whether it only waits for disk space."""
         return self.state is JobState.QUEUED and self.stage == WAITING_FOR_ROOM
 
     @property
@@ -213,7 +213,7 @@ class Claimed:
 
 @dataclass(frozen=True, slots=True)
 class Progressed:
-    """The worker says that it lives and how far it is."""
+    """The worker reports that it is alive, and its progress."""
 
     attempt: int
     at: float
@@ -248,8 +248,8 @@ class Failed:
 class Lost:
     """The worker died, or the service stopped, in the middle of the job.
 
-    `blame` says whether the job may be the reason: a service that was stopped is not. `problem` is
-    what the job fails with in the end, where more is known than that its worker is gone.
+    `blame` says whether the job may be the cause (not if the service was stopped). `problem` is
+    what the job finally fails with, if more is known than that its worker is gone.
     """
 
     attempt: int
@@ -264,7 +264,7 @@ class Lost:
 class NoRoom:
     """The disk is full, or nearly: the job waits until there is room again.
 
-    `room_bytes` is what it needs at least: what it had written when it was stopped.
+    `room_bytes` is the least that it needs: what it had written when it was stopped.
     """
 
     attempt: int
@@ -274,7 +274,7 @@ class NoRoom:
 
 @dataclass(frozen=True, slots=True)
 class Cancelled:
-    """Somebody wants the job no more, whichever attempt it is in."""
+    """The job was cancelled, in whatever attempt."""
 
     at: float
 
@@ -306,7 +306,7 @@ def advance(job: Job, event: Event) -> Job:
         raise Stale(f"job {job.id} is {job.state} in attempt {job.attempt}")
     match event:
         case Progressed():
-            # Progress never runs backwards, whatever the stages think.
+            # Progress never decreases, whatever the stages report.
             fraction = max(min(event.fraction, 1.0), job.progress)
             return replace(
                 job,

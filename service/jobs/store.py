@@ -1,7 +1,7 @@
-"""The record of jobs, in SQLite or PostgreSQL. Files lie elsewhere (`service.storage`).
+"""The job store, in SQLite or PostgreSQL. Files are in `service.storage`.
 
 Every change of a job goes through `service.jobs.state.advance` in one transaction; only `beat`,
-which every worker sends twice a second, is a single statement of the same meaning.
+which every worker calls twice a second, is a single equivalent statement.
 """
 
 from __future__ import annotations
@@ -48,11 +48,10 @@ __all__ = ["BadCursor", "JobStore", "Page"]
 
 _JOBS = tables.jobs.c
 _CLOCKS_APART = 12
-"""A lease this many times longer than allowed was taken before the clock was set."""
+"""A lease that exceeds its duration by this factor dates from before the clock was set."""
 
 
-# Statements of every upload and every look of the reconciler are made once: to put one together
-# takes longer than to execute it.
+# Frequent statements (uploads, reconciler) are built once: building takes longer than executing.
 _QUEUE = queue_order()
 _PLACE = select(_QUEUE.c.place).where(_QUEUE.c.id == bindparam("job_id"))
 _IN_STATE = (
@@ -63,12 +62,12 @@ _IN_STATE = (
 
 
 class BadCursor(ValueError):
-    """The cursor is not one that a page gave."""
+    """The cursor does not come from a page."""
 
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """Some jobs of a list, newest first, and where the next ones begin (None: the list ends)."""
+    """A page of jobs, newest first, and the cursor of the next page (None: there is none)."""
 
     jobs: list[Job]
     next_cursor: str | None
@@ -80,7 +79,7 @@ class JobStore:
     Parameters
     ----------
     engine : sqlalchemy.Engine
-        From `service.database.engine.open_database`; whoever opened it closes it.
+        From `service.database.engine.open_database`; the caller closes it.
 
     Notes
     -----
@@ -101,7 +100,7 @@ class JobStore:
         shared: bool = False,
         audit_row: Mapping[str, Any] | None = None,
     ) -> Job:
-        """Remember a new job, whose input must be stored already.
+        """Add a new job, whose input must already be stored.
 
         Parameters
         ----------
@@ -110,14 +109,14 @@ class JobStore:
             The caller's key, and a digest of the request that came with it.
         limits : Quota, optional
         shared : bool
-            Whether a job that `find_same` finds will do.
+            Whether to reuse a job found by `find_same`.
         audit_row : mapping, optional
             From `AuditLog.row`; written if the job is new, in the same transaction: disks are slow.
 
         Returns
         -------
         Job
-            `job`, or the one that the same request led to before, or the shared one.
+            `job`, or the earlier job of the same request, or the shared one.
 
         Raises
         ------
@@ -137,11 +136,11 @@ class JobStore:
             return row and (row.fingerprint, stored_job(connection, row.job_id))
 
     def find_same(self, owner: str, dedupe_key: str) -> Job | None:
-        """Return the owner's newest job of a dedupe key: one that is done, else under way."""
+        """Return the owner's newest job of a dedupe key: finished, or else in progress."""
         with reading(self.engine) as connection:
             return same_job(connection, owner, dedupe_key)
 
-    # Looking
+    # Reading
 
     def get(self, job_id: str, owner: str | None = None) -> Job | None:
         """Return a job, of this owner if one is given, or None."""
@@ -207,14 +206,14 @@ class JobStore:
         return dict.fromkeys(JobState, 0) | {JobState(state): count for state, count in rows}
 
     def oldest_queued_at(self) -> float | None:
-        """Return when the job was submitted that has been waiting for the longest time."""
+        """Return when the job that has waited longest was submitted."""
         with reading(self.engine) as connection:
             return connection.execute(
                 select(func.min(_JOBS.created_at)).where(_JOBS.state == "queued")
             ).scalar()
 
     def waiting_for_room(self) -> tuple[int, int]:
-        """Return how many jobs wait for room on the disk, and the most that one of them needs."""
+        """Return how many jobs wait for disk space, and the largest need of one."""
         query = select(func.count(), func.max(_JOBS.room_bytes)).where(
             _JOBS.state == "queued", _JOBS.stage == WAITING_FOR_ROOM
         )
@@ -228,7 +227,7 @@ class JobStore:
         return self._jobs(select(tables.jobs).where(_JOBS.state.in_(OVER), *ended))
 
     def usage(self, owner: str) -> tuple[int, int]:
-        """Return how many jobs of an owner are not over, and the bytes of all that are kept."""
+        """Return an owner's number of unfinished jobs, and the bytes of all kept ones."""
         with reading(self.engine) as connection:
             return usage(connection, owner)
 
@@ -239,8 +238,8 @@ class JobStore:
     ) -> list[Job]:
         """Return waiting jobs, short ones or the others, in the order of their start.
 
-        Higher priority first; then owners take turns, where a job that runs was its owner's turn;
-        then the older first. Jobs to `exclude` take their owners' turns but are not returned.
+        Higher priority first; then owners take turns, running jobs included; then older first. Jobs
+        in `exclude` use up their owners' turns but are not returned.
         """
         query = (
             select(tables.jobs)
@@ -266,14 +265,14 @@ class JobStore:
     # Changing
 
     def apply(self, job_id: str, event: Event) -> Job | None:
-        """Let `event` happen to a job.
+        """Apply `event` to a job.
 
-        The transaction that ends a job also notes down who is to be told of it.
+        The transaction that ends a job also records the notifications to send.
 
         Returns
         -------
         Job or None
-            The job afterwards; None if the job is gone, or it is too late for the event.
+            The job afterwards; None if the job is gone or the event is stale.
         """
         with writing(self.engine) as connection:
             job = stored_job(connection, job_id, for_update=True)
@@ -291,7 +290,7 @@ class JobStore:
         return after
 
     def claim(self, job_id: str, at: float, worker: str) -> Job | None:
-        """Start a job unless it no longer waits; of several callers one gets it."""
+        """Start a job if it is still waiting; of several callers, one succeeds."""
         return self.apply(job_id, Claimed(at, worker))
 
     def beat(
@@ -303,7 +302,7 @@ class JobStore:
         fraction: float,
         eta_s: float | None,
     ) -> bool:
-        """Record that a worker lives and its progress; False: it has lost the job and must stop.
+        """Record a heartbeat with progress; False: the worker has lost the job and must stop.
 
         The same as `apply` with `Progressed`, in one statement.
         """
@@ -321,28 +320,28 @@ class JobStore:
         return self._count(statement) > 0
 
     def silent(self, before: float) -> list[Job]:
-        """Return the running jobs whose worker was last heard of before a time."""
+        """Return the running jobs whose last heartbeat was before a time."""
         heard = func.coalesce(_JOBS.heartbeat_at, _JOBS.started_at, 0.0)
         return self._jobs(select(tables.jobs).where(_JOBS.state == "running", heard < before))
 
     # Deleting
 
     def forget(self, job_id: str) -> bool:
-        """Drop a job in whatever state. Return whether it existed.
+        """Delete a job in any state. Return whether it existed.
 
-        If it runs, its worker's next report fails; its files go with the sweep.
+        If it is running, its worker's next report fails; the sweep deletes its files.
         """
         return self._count(delete(tables.jobs).where(_JOBS.id == job_id)) > 0
 
     # Leases
 
     def lease(self, name: str, holder: str, seconds: float, now: float) -> bool:
-        """Take or renew the right to do what only one process may do.
+        """Take or renew a lease for work that only one process may do.
 
         Returns
         -------
         bool
-            Whether `holder` has it until `seconds` from `now`.
+            Whether `holder` has the lease until `seconds` from `now`.
         """
         row = {"name": name, "holder": holder, "expires_at": now + seconds}
         leases = tables.leases.c
@@ -354,7 +353,7 @@ class JobStore:
                 where=or_(
                     leases.holder == holder,
                     leases.expires_at <= now,
-                    # Of a holder whose clock was far ahead: nobody could wait for that.
+                    # From a holder whose clock was far ahead: it would not expire for too long.
                     leases.expires_at > now + _CLOCKS_APART * seconds,
                 ),
             ).returning(leases.holder)

@@ -1,4 +1,4 @@
-"""Submits a job once: idempotency keys, quotas, and requests that share the work of another."""
+"""Submit jobs exactly once: idempotency keys, quotas, and requests that share a job."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ __all__ = [
 ]
 
 _JOBS = tables.jobs.c
-# Statements of every upload are made once: to put one together takes longer than to execute it.
+# Frequent statements are built once: building takes longer than executing.
 _SAME = (
     select(tables.jobs)
     .where(_JOBS.owner == bindparam("owner"), _JOBS.dedupe_key == bindparam("key"))
@@ -46,7 +46,7 @@ _ADD, _ADD_AUDIT = tables.jobs.insert(), tables.audit.insert()
 
 @dataclass(frozen=True, slots=True)
 class Quota:
-    """What one owner may have: unfinished jobs, and bytes of all jobs that are kept."""
+    """Limits of one owner: unfinished jobs, and bytes of all kept jobs."""
 
     max_jobs: int
     max_bytes: int
@@ -54,15 +54,15 @@ class Quota:
     def check(
         self, owner: str, jobs: int, kept_bytes: int, upload_bytes: int | None = None
     ) -> None:
-        """Refuse one job more.
+        """Refuse a further job that exceeds the quota.
 
         Parameters
         ----------
         owner : str
         jobs, kept_bytes : int
-            What the owner has; see `usage`.
+            Current use of the owner; see `usage`.
         upload_bytes : int, optional
-            Of the job's file; where that is not known yet, it has at least one.
+            Size of the job's file; if not yet known, at least one byte.
 
         Raises
         ------
@@ -128,7 +128,7 @@ def submission(owner: str, key: str) -> Select[Any]:
 
 
 def _earlier(connection: Connection, job: Job, key: str, fingerprint: str) -> Job | None:
-    """Return the job of the same request, or note down that `job` is the first one."""
+    """Return the earlier job of the same request, or record `job` as the first."""
     row = {
         "owner": job.owner,
         "idempotency_key": key,
@@ -151,7 +151,7 @@ def _earlier(connection: Connection, job: Job, key: str, fingerprint: str) -> Jo
             "a new request"
         )
     earlier = stored_job(connection, known.job_id)
-    if earlier is None:  # deleted meanwhile: the request counts anew
+    if earlier is None:  # deleted meanwhile: treat it as a new request
         _lead_to(connection, job.owner, key, row)
     return earlier
 
@@ -164,19 +164,19 @@ def _lead_to(connection: Connection, owner: str, key: str, values: dict[str, Any
 
 
 def same_job(connection: Connection, owner: str, dedupe_key: str) -> Job | None:
-    """Return the owner's newest job of a dedupe key: one that is done, else under way."""
+    """Return the owner's newest job of a dedupe key: finished, or else in progress."""
     row = connection.execute(_SAME, {"owner": owner, "key": dedupe_key}).one_or_none()
     return None if row is None else from_row(row)
 
 
 def _stand_in_line(connection: Connection, owner: str) -> None:
-    """Let submissions of one owner come one after the other, so that none overlooks another."""
-    if connection.dialect.name == "postgresql":  # SQLite has locked all
+    """Serialise the submissions of an owner, so that each sees the others."""
+    if connection.dialect.name == "postgresql":  # SQLite locks the whole database
         lock = text("SELECT pg_advisory_xact_lock(hashtextextended(:owner, 7))")
         connection.execute(lock, {"owner": owner})
 
 
 def usage(connection: Connection, owner: str) -> tuple[int, int]:
-    """Return how many jobs of an owner are not over, and the bytes of all that are kept."""
+    """Return an owner's number of unfinished jobs, and the bytes of all kept ones."""
     jobs, size = connection.execute(_USAGE, {"owner": owner}).one()
     return int(jobs), int(size or 0)

@@ -1,4 +1,4 @@
-"""Deletes what is no longer needed: files without a job, attempts that do not count, old jobs."""
+"""Delete what is no longer needed: files without a job, stale attempts, old jobs."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ __all__ = ["Sweep", "sweep_files"]
 
 _JOBS = "jobs/"
 _AT_ONCE = 500
-"""Ids in one question to the database."""
+"""Ids per database query."""
 _DAY_S = 86400.0
 _SUBMISSIONS_KEPT_S = _DAY_S
 _ANSWERS_KEPT_S = _DAY_S
-"""Whatever is no compensation is computed again when somebody asks again."""
+"""Results of other kinds can be computed again on request."""
 _ORPHAN_S = 3600.0
-"""Files without a row are of an upload, until they have been seen without one for so long."""
+"""Files without a row may belong to an upload, until seen without one for this long."""
 _UPLOAD_S = _DAY_S
-"""Uploads that have not grown for so long were broken off: a slow sender may be quiet for long."""
+"""Uploads that have not grown for this long are abandoned; slow senders may pause."""
 
 
 class Sweep:
-    """Sweeps again and again, and remembers what it saw: no clock is asked how old a file is.
+    """Repeated sweeps, which track ages themselves instead of trusting file times.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ class Sweep:
     store : JobStore
     storage : Storage
     clock : callable
-        Seconds from anywhere, which only grow.
+        Monotonic seconds.
     """
 
     def __init__(
@@ -82,17 +82,17 @@ class Sweep:
         self._disk.hold()
 
     def pause(self) -> None:
-        """Say that somebody else sweeps meanwhile, and counts the time."""
+        """Note that another process sweeps and counts the time meanwhile."""
         self._counted_at = None
 
     def _forget_expired(self) -> None:
-        """Delete jobs that were over long ago, and idempotency keys."""
+        """Delete old finished jobs and idempotency keys."""
         at, counted_at = self._clock(), self._counted_at
         now = self._expiry.passed(0.0 if counted_at is None else at - counted_at)
         self._counted_at = at
         cutoff = now - self._settings.keep_days * _DAY_S
         for job_id in self._expiry.old_jobs(cutoff, max(cutoff, now - _ANSWERS_KEPT_S)):
-            # The row first: no job whose files are gone is ever shown.
+            # The row first, so that no job without files is ever shown.
             if self._store.forget(job_id):
                 self._storage.delete(f"{_JOBS}{job_id}/")
         self._expiry.forget_submissions(now - _SUBMISSIONS_KEPT_S)
@@ -108,7 +108,7 @@ class Sweep:
         sweep_files(self._store, self._storage, is_old=is_old)
 
     def _sweep_incoming(self) -> None:
-        """Delete uploads that were broken off, as those of a killed service are."""
+        """Delete abandoned uploads, such as those of a killed service."""
         now, before = self._clock(), self._uploads
         self._uploads = {}
         with contextlib.suppress(FileNotFoundError):
@@ -122,20 +122,19 @@ class Sweep:
 
 
 def sweep_files(store: JobStore, storage: Storage, *, is_old: Callable[[str], bool]) -> int:
-    """Delete files of jobs that are gone and of attempts that do not count.
+    """Delete files of deleted jobs and of stale attempts.
 
-    The files are listed first and the rows read then, so a row is never older than what is judged
-    by it.
+    Files are listed before rows are read, so a row is never older than the files compared with it.
 
     Parameters
     ----------
     is_old : callable
-        Whether files of an id without a row are not of an upload whose row is about to be written.
+        Whether files of an id without a row are too old to belong to a current upload.
 
     Returns
     -------
     int
-        How many prefixes were deleted.
+        Number of deleted prefixes.
     """
     found: dict[str, list[Stat]] = defaultdict(list)
     for stat in storage.list(_JOBS):
@@ -171,7 +170,7 @@ def _delete(path: Path) -> None:
 def _dead_attempts(job: Job, files: list[Stat]) -> set[str]:
     """Return the prefixes of a job's attempts that will never count.
 
-    One that was given up may still be writing when this looks; the next sweep finds the rest.
+    An abandoned one may still be writing; the next sweep finds the rest.
     """
     alive = {job.output}
     if job.state is JobState.RUNNING:

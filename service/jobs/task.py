@@ -1,4 +1,4 @@
-"""One attempt at a job as the computation sees it: plain values, and files on this computer."""
+"""One attempt at a job as passed to a computation: plain values and local files."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ class Task:
     machine_file : Path
         Machine that the job was accepted with (`applications.machines.resolve.PinnedMachine`).
     sources : tuple of Path
-        To be read only.
+        Read-only.
     target, report : Path
-        File and folder to be made; the folders above exist.
+        File and folder to create; their parents exist.
     cache_dir : Path
-        What is worth keeping between jobs.
+        Cache kept between jobs.
     attempt : int
-        Which one it is, from 1.
+        Number of the attempt, from 1.
     """
 
     machine: str
@@ -63,4 +63,4 @@ class Task:
 
 
 Runner = Callable[[Task, Callable[[Progress], None]], dict[str, Any]]
-"""Does the work of a task and returns the figures that lists show; importable by its name."""
+"""Does the work of a task, and returns the figures shown in lists; importable by name."""

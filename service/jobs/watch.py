@@ -1,7 +1,7 @@
-"""Watches one attempt from its own thread: reports that it lives, and ends it when necessary.
+"""Watch one attempt from a separate thread: send heartbeats, and end it when necessary.
 
-The pipeline learns of it in its progress callback. If it never asks, the process is ended; the one
-that looks after the workers starts another.
+The pipeline is stopped in its progress callback. If that is not called, the process is ended, and
+its supervisor starts another.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ STUCK_EXIT_CODE = 70
 _BEAT_S = 0.5
 _MIB = 1 << 20
 _SHORT_GRACE_S = 1.0
-"""Short jobs seldom say where they are; to start another process costs less than to wait."""
+"""Short jobs rarely report progress; restarting the process costs less than waiting."""
 _SHORT_REMEDIES = {
     JobKind.IDENTIFICATION: "Send the test as the firmware wrote it, fewer files at once",
     JobKind.DESIGN: "Give the machine fewer members or places",
@@ -41,7 +41,7 @@ _SHORT_REMEDIES = {
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What an attempt may take, and the settings that say so (`service.settings.Settings`)."""
+    """Limits of an attempt, and the settings that define them (`service.settings.Settings`)."""
 
     max_s: float
     max_bytes: int
@@ -65,7 +65,7 @@ class Limits:
         )
 
     def too_long(self, seconds: float) -> dict[str, object]:
-        """Return the problem of a job that took so long."""
+        """Return the problem of a job that took too long."""
         return problem(
             422,
             "The job takes too long",
@@ -89,27 +89,27 @@ def held_bytes() -> int:
 
 
 class Watch:
-    """The eye on one attempt, for a `with` block around the work.
+    """Watches one attempt during a `with` block around the work.
 
     Parameters
     ----------
     store : JobStore
     job : Job
-        As it was claimed.
+        The claimed job.
     limits : Limits
     interrupted : callable
-        Says why this worker has to give its job back, or None.
+        Returns why this worker has to give its job back, or None.
     has_room : callable
-        Whether the disk has room for more; the rest of it belongs to the database.
+        Whether the disk has room for more, apart from the database's reserve.
     end : callable
         Ends this process with an exit code.
     no_room : callable
-        Says what becomes of the job where it has none.
+        Returns the job's event if there is no room.
 
     Attributes
     ----------
     outgrown : bool
-        Whether the process is too large to go on after this job.
+        Whether the process is too large to continue after this job.
     """
 
     def __init__(
@@ -155,11 +155,11 @@ class Watch:
 
     @property
     def verdict(self) -> Event | None:
-        """What the watch decided on and the database does not know yet."""
+        """Decision of the watch that is not in the database yet."""
         return self._verdict
 
     def tell(self, progress: Progress) -> None:
-        """Take the pipeline's progress.
+        """Record the pipeline's progress.
 
         Raises
         ------
@@ -189,7 +189,7 @@ class Watch:
                 elif not self._stop.is_set():
                     self._look()
             except DatabaseAway as error:
-                # The work goes on: when the database is back, the fence tells whose job it is.
+                # The work continues: when the database is back, the fencing token decides.
                 self._log.warning("database away", error=str(error))
             except Exception:
                 self._log.exception("the watch of a job failed")

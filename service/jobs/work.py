@@ -1,4 +1,4 @@
-"""One interface to all of the work, for the API: start, stop, look up."""
+"""The API's interface to all job processing: start, stop, status."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Work:
     storage : Storage
         Store and storage are the caller's to close, after `stop`.
     runner : Runner
-        Does the work of a job in the worker process; tests put another in.
+        Does the work of a job in the worker process; replaceable in tests.
     """
 
     def __init__(
@@ -37,11 +37,11 @@ class Work:
         self._reconciler = Reconciler(settings, store, storage, self._cluster)
 
     def start(self) -> None:
-        """Begin, in threads; returns at once, workers come up meanwhile."""
+        """Start the threads and return immediately; workers start in the background."""
         self._reconciler.start()
 
     def stop(self) -> None:
-        """End. Jobs that run in our own workers go back to the queue, those elsewhere go on."""
+        """Stop. Jobs in our own workers go back to the queue, remote ones continue."""
         self._reconciler.stop()
         self._cluster.close()
         self._reconciler.leave()
@@ -52,7 +52,7 @@ class Work:
 
     @property
     def workers(self) -> int:
-        """How many jobs can run at once, as far as is known."""
+        """Number of jobs that can run at once, as far as known."""
         return self._reconciler.slots
 
     @property

@@ -1,8 +1,8 @@
 """One attempt at a job, in a worker process: claim it, run it, store its files, report.
 
-Nothing but the job's id travels through Dask; everything else is read from database and storage.
-An attempt's files lie under a prefix of its own, so that two attempts never meet, and the row
-names the prefix of the one that counts.
+Only the job's id passes through Dask; everything else is read from database and storage. Each
+attempt's files have their own prefix, so that attempts never collide, and the row names the prefix
+of the valid one.
 """
 
 from __future__ import annotations
@@ -49,11 +49,11 @@ from stillpath.service.storage.factory import open_storage
 __all__ = ["Workplace", "execute", "run_compensation", "run_job"]
 
 _PATIENCE_S = 60.0
-"""How long storage and database may be away before an attempt is given up."""
+"""Time for which storage and database may be unavailable before an attempt is given up."""
 _LONGEST_PAUSE_S = 4.0
 _KEPT_BYTES = 256 << 20
 _MOST_KEPT_BYTES = 512 << 20
-"""A process that is larger after a short job ends: what it keeps would count for the next one."""
+"""Memory after a short job above which the process ends, as it would count for the next job."""
 
 _Given = TypeVar("_Given")
 
@@ -64,16 +64,16 @@ class _InputGone(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Workplace:
-    """What a worker has around it.
+    """The environment of a worker.
 
     Attributes
     ----------
     scratch : Path
-        Folder for files that are being made.
+        Folder for temporary files.
     name : str
-        Of the worker.
+        Name of the worker.
     interrupted : callable
-        Says why the worker has to give its job back, or None.
+        Returns why the worker has to give its job back, or None.
     end : callable
         Ends this process with an exit code.
     """
@@ -88,7 +88,7 @@ class Workplace:
 
 
 def run_job(job_id: str, settings: dict[str, Any] | None, runner: str) -> None:
-    """Do one job in a Dask worker, unless somebody else does it or did it.
+    """Do one job in a Dask worker, unless another worker has claimed it.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ def run_job(job_id: str, settings: dict[str, Any] | None, runner: str) -> None:
 
 
 def execute(job_id: str, workplace: Workplace, runner: Runner) -> None:
-    """Claim a job, do it, and write down how it ended; if it cannot be claimed, do nothing."""
+    """Claim a job, do it, and record its outcome; do nothing if it cannot be claimed."""
     store = workplace.store
     job = _patiently(
         lambda: store.claim(job_id, time.time(), workplace.name), DatabaseAway, time.sleep
@@ -126,7 +126,7 @@ def execute(job_id: str, workplace: Workplace, runner: Runner) -> None:
     log = structlog.get_logger("worker")
     settings = workplace.settings
     limits = Limits.of(job.kind, settings)
-    # The watch looks now and then; this holds in between. Freed memory that is kept counts here.
+    # The watch checks periodically; this limit acts in between, and includes freed memory.
     limit_memory(limits.max_bytes + max(limits.max_bytes // 4, _KEPT_BYTES))
     if job.kind is not JobKind.COMPENSATION:
         runner = run_computation
@@ -144,7 +144,7 @@ def execute(job_id: str, workplace: Workplace, runner: Runner) -> None:
         log.info("job started", worker=workplace.name)
         with watch:
             event = _attempt(job, workplace, runner, watch, limits)
-        # A verdict of the watch that the database has not heard of comes first.
+        # A decision of the watch that was not stored yet comes first.
         for said in (watch.verdict, event):
             if said is not None:
                 _report(store, job, said)
@@ -193,7 +193,7 @@ def _attempt(
 ) -> Event | None:
     """Return how the attempt ended; None if it was stopped from outside.
 
-    A full disk is nobody's fault: the job waits for room.
+    A full disk is not a failure: the job waits for room.
     """
     try:
         with _folder(_place(job, workplace)) as folder:
@@ -203,7 +203,7 @@ def _attempt(
                 if error.errno not in DISK_FULL:
                     raise
                 structlog.get_logger("worker").warning("no room for the job", reason=str(error))
-                # While it can be seen what it has written.
+                # Now, while the files it has written still exist.
                 if isinstance(error, StorageError) and workplace.settings.storage_url is not None:
                     return _no_room_in_storage(job, workplace)
                 return _no_room(job, workplace)
@@ -219,7 +219,7 @@ def _attempt(
             return NoRoom(job.attempt, time.time())  # not even for its folder
         _log_crash()
         if isinstance(error, StorageError):
-            # Perhaps it answers another worker, or later.
+            # Another worker, or a later attempt, may succeed.
             return Lost(
                 job.attempt,
                 time.time(),
@@ -236,7 +236,7 @@ def _attempt(
 
 
 def _no_room(job: Job, workplace: Workplace) -> Event:
-    """Return what becomes of a job that the disk has no room for, by what it has written."""
+    """Return the event for a job without disk space, by what it has written."""
     disk = Disk(workplace.settings.data_dir, workplace.settings.disk_reserve_bytes)
     written = _written_bytes(job, workplace)
     if disk.fits_ever(written + job.source_bytes):
@@ -245,7 +245,7 @@ def _no_room(job: Job, workplace: Workplace) -> Event:
 
 
 def _no_room_in_storage(job: Job, workplace: Workplace) -> Event:
-    """Return what becomes of a job whose result the disk of the storage has no room for."""
+    """Return the event for a job whose result does not fit into the storage."""
     needed = _written_bytes(job, workplace)
     room = None
     with contextlib.suppress(StorageError):
@@ -258,9 +258,9 @@ def _no_room_in_storage(job: Job, workplace: Workplace) -> Event:
 
 
 def _written_bytes(job: Job, workplace: Workplace) -> int:
-    """Return how much lies in the attempt's folder."""
+    """Return the size of the attempt's folder."""
     written = 0
-    with contextlib.suppress(OSError):  # files come and go meanwhile
+    with contextlib.suppress(OSError):  # files may disappear meanwhile
         for path in _place(job, workplace).rglob("*"):
             written += path.stat().st_size
     return written
@@ -320,16 +320,16 @@ def _work(job: Job, workplace: Workplace, runner: Runner, watch: Watch, folder: 
 
 
 def _report(store: JobStore, job: Job, event: Event) -> None:
-    # Should the database break after it has taken the event, the second try is stale: no harm.
+    # If the database fails after storing the event, the retry is stale and harmless.
     _patiently(lambda: store.apply(job.id, event), DatabaseAway, time.sleep)
 
 
 def _tidy(job: Job, workplace: Workplace) -> None:
-    """Delete what the attempt has put away, unless the job's row names it.
+    """Delete the attempt's stored files unless the job's row refers to them.
 
-    The job may have been deleted or cancelled meanwhile, or given to somebody else.
+    The job may have been deleted, cancelled or reassigned meanwhile.
     """
-    with contextlib.suppress(DatabaseAway, StorageError):  # then the sweep finds it
+    with contextlib.suppress(DatabaseAway, StorageError):  # otherwise the sweep deletes them
         row = workplace.store.get(job.id)
         if row is None:
             workplace.storage.delete(job.files)
@@ -342,7 +342,7 @@ def _patiently(
     trouble: type[Exception],
     pause: Callable[[float], None],
 ) -> _Given:
-    """Repeat `action` while it raises `trouble`, up to a limit; a full disk is not waited for."""
+    """Repeat `action` while it raises `trouble`, up to a limit; do not wait for a full disk."""
     deadline = time.monotonic() + _PATIENCE_S
     wait_s = 0.2
     while True:

@@ -1,4 +1,4 @@
-"""Steps of bodies with dry friction."""
+"""Kernel that simulates bodies with dry friction."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ def followed(
     bend: Array,
     states: Array,
 ) -> None:
-    """Fill states (n, 2 coordinates) of bodies that rest at first and follow a command (2, n).
+    """Compute states (n, 2 coordinates) of bodies that follow a command (2, n) from rest.
 
-    The command is linear over a step, its rate therefore constant; friction is bent by what slips
-    in a step, exactly for a constant rate (Dahl 1968), and then pulls through the next one.
+    The command is linear over a step, so its rate is constant; friction follows the slip of a step,
+    exactly for a constant rate (Dahl 1968), and acts during the next one.
     """
     size = step.shape[0]
     half = size // 2

@@ -1,10 +1,9 @@
-"""Bodies on springs, dampers and dry friction, moved by motors: a printer before it is fitted.
+"""Bodies on springs, dampers and dry friction, moved by motors: the physics of a printer.
 
 Coordinates p are displacements in mm. Every element has an elongation e p - g c, c the commanded X
-and Y: a spring force k times that and a damping force d times its rate pull along e. A motor holds
+and Y: a spring force k times that and a damping force d times its rate act along e. A motor holds
 its rotor to the command by a spring (the magnetic field); a belt has e = carriage - frame - rotor.
-Friction follows Dahl's model: as a sliding surface is first bent and then dragged along, it is a
-stiff spring for micrometres and a constant force beyond.
+Friction follows Dahl's model: a stiff spring for micrometres and a constant force beyond.
 """
 
 from __future__ import annotations
@@ -32,9 +31,9 @@ class Element:
     Attributes
     ----------
     along : dict of str to float
-        How much the element grows when a coordinate does.
+        Elongation of the element per unit of a coordinate.
     command : (float, float)
-        How much it shrinks when the commanded X and Y grow.
+        Shortening per unit of the commanded X and Y.
     k_n_m, d_n_s_m : float
         Stiffness, and damping against the rate of the elongation.
     """
@@ -52,11 +51,11 @@ class Friction:
     Attributes
     ----------
     along : dict of str to float
-        How much slips when a coordinate grows.
+        Slip per unit of a coordinate.
     force_n : float
-        Of sliding.
+        Sliding friction.
     bend_mm : float
-        Over which it builds up.
+        Slip over which friction builds up.
     """
 
     along: dict[str, float]
@@ -66,7 +65,7 @@ class Friction:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
-    """What the bodies did, one sample per command.
+    """Motion of the bodies, one sample per command.
 
     Attributes
     ----------
@@ -98,7 +97,7 @@ class Bodies:
         return tuple(self.masses_kg)
 
     def matrices(self) -> tuple[Array, Array, Array, Array, Array]:
-        """Return M, D, K (n, n) and how command and its rate push, shapes (n, 2): g K and g D."""
+        """Return M, D, K (n, n) and the inputs of command and its rate, shapes (n, 2)."""
         n = len(self.masses_kg)
         d, k = np.zeros((n, n)), np.zeros((n, n))
         by_command, by_rate = np.zeros((n, 2)), np.zeros((n, 2))
@@ -153,14 +152,14 @@ class Bodies:
             u,
             dt_s,
             np.ascontiguousarray(slips),
-            # Masses in kg and ways in mm make forces in mN.
+            # Masses in kg and lengths in mm give forces in mN.
             1e3 * np.array([f.force_n for f in self.frictions]),
             np.array([f.bend_mm for f in self.frictions]),
             states,
         )
         velocity = states[:, n:].T
         accel = np.gradient(velocity, dt_s, axis=1)
-        # At rest at the start, everything stands where the first command puts it.
+        # At the start everything rests where the first command puts it.
         standing = np.linalg.solve(k, by_command) @ start
         return Motion(states[:, :n].T + standing, velocity, accel)
 

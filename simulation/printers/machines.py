@@ -1,7 +1,7 @@
 """Printers made of bodies: bed slingers and CoreXY machines, and where they print and measure.
 
-The nozzle prints relative to the bed, and an accelerometer feels its body against the ground; a
-frame that shakes by reaction therefore shows in the second more than in the first.
+The nozzle prints relative to the bed, while an accelerometer measures its body against the ground;
+a frame excited by reaction therefore shows more in the second than in the first.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Mount:
-    """How something hangs on what carries it: mass, natural frequency when held there, damping."""
+    """The mounting of a body: mass, natural frequency on a fixed support, damping."""
 
     mass_kg: float
     f_hz: float
     zeta: float
 
     def element(self, along: dict[str, float]) -> Element:
-        """Return the spring and damper that make it so."""
+        """Return the corresponding spring and damper."""
         w = 2 * np.pi * self.f_hz
         return Element(along, self.mass_kg * w * w, 2 * self.zeta * self.mass_kg * w)
 
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """A drive by motor and belt, and what rides on it.
+    """A drive by motor and belt, and its load.
 
     Attributes
     ----------
@@ -99,14 +99,14 @@ class CoreXY:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Printer:
-    """Bodies, and which of them print and feel.
+    """Bodies, with the positions of nozzle and accelerometer.
 
     Attributes
     ----------
     nozzle : ndarray, shape (2, coordinates)
         Position of the nozzle relative to the bed, in commanded X and Y.
     felt : ndarray, shape (2, coordinates)
-        What an accelerometer rides on in tests of X and of Y.
+        Body that carries the accelerometer in tests of X and of Y.
     """
 
     name: str

@@ -39,9 +39,9 @@ class Accelerometer:
     gains : tuple of float
         Of its three axes.
     turn_rad : tuple of float
-        By how much it is turned about x, y and z.
+        Rotation about x, y and z.
     offset_s : float
-        By how much its clock is ahead of the command's.
+        Lead of its clock over the command's.
     """
 
     rate_hz: float
@@ -64,7 +64,7 @@ class Accelerometer:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Record:
-    """What an accelerometer said: `time_s` (n,), `accel_mm_s2` (n, 3)."""
+    """Record of an accelerometer: `time_s` (n,), `accel_mm_s2` (n, 3)."""
 
     time_s: Array
     accel_mm_s2: Array
@@ -111,7 +111,7 @@ def run_test(
     rng: np.random.Generator,
     test: Excitation = NEW_TEST,
 ) -> Record:
-    """Test an axis, "x" or "y"; each run finds the machine a little changed.
+    """Test an axis, "x" or "y"; the machine changes slightly from run to run.
 
     Stiffnesses move by 1 % (half of that in frequency), dry friction by 10 %, from run to run.
     """

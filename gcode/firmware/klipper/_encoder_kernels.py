@@ -1,4 +1,4 @@
-"""Loop of the Klipper encoder: speeds that land on time."""
+"""Kernel of the Klipper encoder: choose feedrates that end segments on time."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from stillpath.models.jit import kernel
 __all__ = ["assign_speeds", "expected_braking"]
 
 RUSH = 0.5
-"""No segment is hurried to less than this part of its planned time."""
+"""Shortest time of a segment relative to its planned one."""
 MOST_LOST = 0.8
-"""The law of losses holds where a ramp fits into its segment: more than this part of its time is
-not believed to be lost."""
+"""Largest loss assumed, relative to a segment's time: the formula is valid only if the ramp fits
+into the segment."""
 CATCH_UP = 0.1
-"""What a stretch is late is made up for by so much of every segment's planned time."""
+"""Share of every segment's planned time by which a late stretch catches up."""
 _ROUNDS = 3
 _SETTLED_MM_S = 1e-4
-"""A speed that changes by less is as good as it gets: F has steps of 1.7e-3 mm/s and more."""
+"""Convergence limit of speeds: F has steps of 1.7e-3 mm/s or more."""
 
 
 @kernel(allocates=False)
@@ -31,7 +31,7 @@ def expected_braking(
     planned_s: NDArray[np.float64],
     braking_s: NDArray[np.float64],
 ) -> None:
-    """Find what is lost by braking at the end of every segment of ours if all keep their times.
+    """Compute the time lost by braking at the end of each segment of ours if all are on time.
 
     See `assign_speeds`; `braking_s` is what it starts from.
     """
@@ -65,18 +65,18 @@ def assign_speeds(
     feedrate: NDArray[np.float64],
     predicted_s: NDArray[np.float64],
 ) -> None:
-    """Feedrates (mm/min, as they will be printed) that reach every end at its time.
+    """Compute feedrates (mm/min, as printed) that reach every end on time.
 
     Moves with `ours` false have their own speed, moves with `stops` true (extruder alone) start
     and end at rest. `allowed.speed_mm_s` is the speed of a foreign move and the highest one of
     ours.
 
-    The time still to spend is the target minus the time predicted so far. Klipper loses
-    (v1 - v2)^2 / (2 a v) at a step between speeds v1 and v2; that loss is taken off first. What
-    is lost by braking at the end of a segment hangs on the next one: `braking_s` holds what is
-    expected, or was found by the run before, and is renewed. A stretch starts when the rest
-    before it is over: its times move with that. Where a segment cannot keep its time, what is owed
-    is made up for by those after it, little by little.
+    The time of a segment is its target end minus the time predicted so far. Klipper loses
+    (v1 - v2)^2 / (2 a v) at a step between speeds v1 and v2; that loss is subtracted first. The
+    loss by braking at the end of a segment depends on the next one: `braking_s` is the expected one
+    or that of the previous pass, and is updated. A stretch starts when the rest before it is over,
+    and its times shift accordingly. If a segment cannot be on time, the following ones gradually
+    make up for it.
     """
     length_mm, accel_mm_s2, speed_mm_s, junction_mm_s = allowed
     now = start_s
@@ -126,7 +126,7 @@ def assign_speeds(
             before_accel = accel_mm_s2[pending]
             pending = -1
         if i > 0 and not ours[i - 1]:
-            # The stretch starts when its rest is over, whenever that is.
+            # The stretch starts when its rest is over.
             late = now + planned_s[i] - end_s[i]
             owed = 0.0
         made_up = min(owed, CATCH_UP * planned_s[i])
@@ -140,8 +140,7 @@ def assign_speeds(
             available = least
         chained = i > 0 and ours[i - 1]
         twice_accel = 2.0 * accel_mm_s2[i]
-        # What the segment before was given for braking is no time of this one, and this one
-        # brakes itself.
+        # Exclude the braking time given to the segment before, and include this one's own.
         known = braking_s[i] - (braking_s[i - 1] if chained else 0.0)
         brakes = 1.0 / (2.0 * before_accel * before) if before > 0.0 else 0.0
         most_braking = MOST_LOST * planned_s[i - 1] if chained else np.inf
@@ -153,7 +152,7 @@ def assign_speeds(
                 lost += (v - corner) ** 2 / (twice_accel * v)
             last = v
             v = min(length_mm[i] / (available - min(lost, MOST_LOST * available)), speed_mm_s[i])
-            # No faster than it gets within its length; there the law holds to the last.
+            # No faster than reachable within its length, where the formula is still valid.
             fastest2 = corner * corner + twice_accel * length_mm[i]
             if v * v > fastest2:
                 v = np.sqrt(fastest2)

@@ -1,4 +1,4 @@
-"""Kernel of the Klipper encoder: what the firmware allows every move, without look-ahead."""
+"""Kernel of the Klipper encoder: limits of every move without look-ahead."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def move_limits(
     allowed: MoveLimits,
     stops: Any,
 ) -> None:
-    """Find what is allowed to every move.
+    """Compute the limits of every move.
 
     Rules: klippy/toolhead.py, klippy/kinematics/extruder.py, 2026-08.
 
@@ -64,7 +64,7 @@ def move_limits(
             # From rest to rest; the minimum cruise ratio caps the peak as a gentler acceleration.
             velocity = min(velocity, sqrt(path * min(own[1] * (1.0 - own[3]), most)))
         accel[i], speed[i] = most, velocity
-        # The deviation belongs to the limits, the acceleration to the move: Z's is lower.
+        # The deviation follows from the limits, the acceleration from the move: Z's is lower.
         corner *= sqrt(most / own[1])
         junction[i] = 0.0
         if i > 0:

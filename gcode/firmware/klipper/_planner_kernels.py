@@ -98,7 +98,7 @@ def append(
             elif ratio > facts[C_E_RATIO] and de > facts[C_NOZZLE] * facts[C_E_RATIO]:
                 return count, E_TOO_THICK, m
         row[Q_PATH] = path
-        # Multiplied as Klipper does it: near a reversal the corner speed depends on the last bit.
+        # Same arithmetic as Klipper: near a reversal the corner speed depends on the last bit.
         inverse = 1.0 / path
         row[Q_DIRECTION] = dx * inverse
         row[Q_DIRECTION + 1] = dy * inverse
@@ -122,7 +122,7 @@ def append(
 
 @kernel(allocates=False)
 def _junction(before: Any, row: Any, e_corner: float) -> None:
-    """Highest speed at which the corner between two moves may be passed."""
+    """Set the highest speed at which the corner between two moves may be passed."""
     v2 = min(row[Q_CRUISE2], before[Q_CRUISE2], before[Q_JUNCTION2] + before[Q_GAIN2])
     e_step = abs(row[Q_DIRECTION + 3] - before[Q_DIRECTION + 3])
     if e_step != 0.0:
@@ -140,7 +140,7 @@ def _junction(before: Any, row: Any, e_corner: float) -> None:
             radius * row[Q_DEVIATION] * row[Q_ACCEL],
             radius * before[Q_DEVIATION] * before[Q_ACCEL],
         )
-        # The rounding circle touches neither leg beyond its middle.
+        # The rounding arc may use at most half of each leg.
         quarter_tan = 0.25 * sin_half / cos_half
         v2 = min(v2, row[Q_GAIN2] * quarter_tan, before[Q_GAIN2] * quarter_tan)
     row[Q_JUNCTION2] = v2

@@ -1,9 +1,9 @@
-"""Encodes a compensated command as the G1 lines that make Klipper execute it.
+"""Encode a compensated command as G1 lines that make Klipper execute it.
 
-Klipper re-plans every line, under the acceleration and corners that the motors bear: so the stream
-may break off at any line. What ramps cost at steps of speed is predicted by its law and taken off
-the feedrate. The firmware's own planner then says whether that was right; what the law misses,
-which is rare, is corrected in another pass (docs/emission.md).
+Klipper plans every line under acceleration and corner limits that the motors can follow, so the
+stream may be interrupted at any line. The time that ramps cost at speed steps is predicted by a
+formula and compensated in the feedrates. The firmware's own planner then checks the times; rare
+deviations from the formula are corrected in another pass (docs/emission.md).
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ __all__ = ["KlipperEncoder", "stream_limits"]
 
 
 _GRID = 100
-"""1e-6 mm, of X and Y; the last point of every stretch keeps all the file's digits. Rounding to
-1 um is noise at all frequencies, and a resonance above the model's band makes microns of it
+"""1e-6 mm, of X and Y; the last point of every stretch keeps all the file's digits. Rounding to 1
+um would be noise at all frequencies, which a resonance above the model's band amplifies to microns
 (docs/tried.md)."""
 _Z_GRID = 10
-"""A slow climb, a vase's, on steps of a um is flat and then too steep for Z's low acceleration."""
+"""On a 1 um grid a slow climb, as in a vase, is flat and then too steep for Z's acceleration."""
 _PASSES = 4
 _TIME_TOLERANCE_S = 2e-6
 
@@ -53,12 +53,12 @@ _TIME_TOLERANCE_S = 2e-6
 def stream_limits(
     firmware: Klipper, command: CommandLimits, mesh_slope: float = 0.0
 ) -> KlipperLimits:
-    """Return the limits of a stream: those of the motors, so that it may break off anywhere.
+    """Return the limits of a stream: those of the motors, so that it may be interrupted anywhere.
 
     Parameters
     ----------
     command : CommandLimits
-        What the motors bear.
+        Limits of the motors.
     mesh_slope : float
         Largest slope of the bed mesh. Klipper adds the mesh's Z to every move and then caps it by
         the limits of Z (klippy/extras/bed_mesh.py, kinematics/cartesian.py, 2026-08). Those limits
@@ -85,7 +85,7 @@ class KlipperEncoder:
     ----------
     firmware : Klipper
     limits : KlipperLimits
-        What the stream runs under.
+        Limits of the stream.
     """
 
     grid_mm = _GRID / UNITS_PER_MM
@@ -95,7 +95,7 @@ class KlipperEncoder:
         self._grids = np.array([_GRID, _GRID, _Z_GRID])
 
     def rest_durations(self, piece: Piece, groups: Sequence[Group]) -> NDArray[np.float64]:
-        """First guess of the rests' durations: their own moves between stretches of the stream."""
+        """Return estimated durations of rests: their own moves between stretches of the stream."""
         rows = np.full(len(piece.moves), -1)
         for group in groups:
             if group.rest:
@@ -112,7 +112,7 @@ class KlipperEncoder:
         Raises
         ------
         GcodeError
-            When the firmware would refuse a move.
+            If the firmware would refuse a move.
         """
         moves = interleave(piece, timeline, segments, self._grids)
         rows = moves.row
@@ -156,7 +156,7 @@ class KlipperEncoder:
         limits_id: NDArray[np.int32],
         limits: Sequence[Limits],
     ) -> tuple[MoveLimits, NDArray[np.bool_]]:
-        """Return what is allowed to every move, and which are of the extruder alone."""
+        """Return the limits of every move, and which are of the extruder alone."""
         planner, extruder = self._firmware.planner, self._firmware.extruder
         facts = (
             planner.max_z_velocity_mm_s,

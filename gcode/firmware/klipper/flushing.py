@@ -1,8 +1,8 @@
-"""How long Klipper stands still for a command that waits until all steps are made.
+"""Compute how long Klipper stands still for a command that flushes step generation.
 
-Steps are made some time ahead of their motion, as far as input shaper and pressure advance look
-ahead. SET_INPUT_SHAPER makes all of them: the next move starts later by the time ahead that held
-until then, and by that which holds from then on.
+Steps are generated ahead of their motion, by the look-ahead of input shaper and pressure advance.
+SET_INPUT_SHAPER flushes them all: the next move starts later by the look-ahead before the command
+plus that after it.
 
 Sources: klippy/toolhead.py (flush_step_generation, note_step_generation_scan_time,
 _calc_print_time), klippy/extras/input_shaper.py, klippy/kinematics/extruder.py, 2026-08.
@@ -30,7 +30,7 @@ _KINDS = tuple(SHAPERS)
 
 
 def pressure_advance(state: MachineState, command: Command) -> int:
-    """SET_PRESSURE_ADVANCE: the motion does not notice, but the next flush does."""
+    """SET_PRESSURE_ADVANCE: affects only the next flush, not the motion."""
     given = state.extended(command)
     for key in ("ADVANCE", "SMOOTH_TIME"):
         if key in given:
@@ -39,7 +39,7 @@ def pressure_advance(state: MachineState, command: Command) -> int:
 
 
 def shaper(state: MachineState, command: Command) -> int:
-    """SET_INPUT_SHAPER: stands still for the times ahead before and after it."""
+    """SET_INPUT_SHAPER: stands still for the look-ahead before plus that after it."""
     given = state.extended(command)
     before_s = _ahead_s(state)
     for axis in "XY":

@@ -1,8 +1,8 @@
 """Klipper's planner: from moves to phases of constant acceleration.
 
-`Planner` gives for any cutting of the stream what a look-ahead over the whole stretch between
-two stops gives; Klipper's own queue of a quarter second agrees with it on the golden files.
-The rules stand in `_planner_kernels`; sources: klippy/toolhead.py, klippy/kinematics/extruder.py,
+However the stream is divided, `Planner` gives the result of a look-ahead over the whole stretch
+between two stops; Klipper's own queue of a quarter second agrees with it on the golden files.
+The rules are in `_planner_kernels`; sources: klippy/toolhead.py, klippy/kinematics/extruder.py,
 2026-08.
 """
 
@@ -56,7 +56,7 @@ class Planner(QueuePlanner):
         self._retry = 0
 
     def _due(self) -> bool:
-        # A queue that settles nothing is not searched again before it has doubled.
+        # After a search that settled nothing, wait until the queue has doubled.
         return self._count >= self._retry
 
     def _append(self, moves: Moves, rows: slice) -> tuple[int, int]:

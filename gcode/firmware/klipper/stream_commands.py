@@ -19,7 +19,7 @@ SIGNATURE = (
     rb"SET_VELOCITY_LIMIT VELOCITY=\S+ ACCEL=\S+ ACCEL_TO_DECEL=\S+ "
     rb"SQUARE_CORNER_VELOCITY=\S+ MINIMUM_CRUISE_RATIO=0\s"
 )
-"""Limits of a stream, in an order and for two ages of Klipper at once, as nobody else has them."""
+"""Limits of a stream, for old and new Klipper at once, in an order that only this program uses."""
 
 
 class KlipperStreamCommands:

@@ -1,4 +1,4 @@
-"""Loops of the Marlin encoder: vertices on whole steps, and step rates that land on time."""
+"""Kernels of the Marlin encoder: vertices on whole steps, and step rates that end on time."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ __all__ = ["Blocks", "assign_rates", "bend_reversals", "spread_advance", "thin"]
 Array = NDArray[np.float64]
 
 RUSH, RUSH_MM_S = 1.25, 10.0
-"""No segment is hurried beyond this much of its planned speed and this much more: what is lost at
-one step is made up for over the next segments, not by a jerk."""
+"""Largest speed of a segment, as a factor of its planned one plus a constant: lost time is made up
+over several segments, not by a jerk."""
 _NEARLY_BACK = 0.9999
 
 
@@ -34,10 +34,10 @@ def thin(
     corexy: bool,
     keep: Any,
 ) -> None:
-    """Choose the vertices that the firmware executes: `least` steps apart, no more than come in.
+    """Choose vertices at least `least` steps apart, and no more than the link can deliver.
 
-    Lines come in at `rate` a second; while the motion waits for them it lives on `burst` blocks of
-    the queue, which fills again when there are fewer.
+    Lines arrive at `rate` per second; faster bursts use up to `burst` blocks of the queue, which
+    refills afterwards.
 
     Parameters
     ----------
@@ -83,11 +83,11 @@ def thin(
 
 @kernel
 def bend_reversals(steps: Any, begin: Any, group: Any, wish: Any, least: int, corexy: bool) -> None:
-    """Make no vertex an exact turn back: by junction deviation the releases would stop there.
+    """Avoid exact reversals at vertices: with junction deviation the releases would stop there.
 
-    They begin at 120 steps/s after it, which takes 1/120 s for the first step. A step to the side
-    at the next vertex, towards where it was meant to be, is angle enough; away from there, where
-    the firmware would swallow a move of fewer than `least` steps otherwise.
+    They restart at 120 steps/s, so the first step takes 1/120 s. A sideways step at the next vertex
+    avoids that, towards its intended position, or away from it where the move would otherwise have
+    fewer than `least` steps and be swallowed.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ def spread_advance(
     start_s: Any,
     lead_mm: Any,
 ) -> None:
-    """How far the filament is ahead at each end: as wanted, no faster than the extruder may.
+    """Compute the lead of the filament at each end: as wanted, within the extruder's speed.
 
     Parameters
     ----------
@@ -149,7 +149,7 @@ def spread_advance(
     start_s : ndarray, shape (groups,)
         When each group starts.
     lead_mm : ndarray, shape (n,)
-        Filled. A stretch begins and ends with none.
+        Output. A stretch begins and ends without lead.
     """
     count = len(end_s)
     now = before_s = 0.0
@@ -171,7 +171,7 @@ def spread_advance(
 
 @kernel
 def _far_enough(steps: Any, begin: Any, group: Any, k: int, least: int, corexy: bool) -> bool:
-    """Tell whether a vertex is `least` steps from both of its neighbours."""
+    """Return whether a vertex is at least `least` steps from both neighbours."""
     first = k == 0 or group[k - 1] != group[k]
     before = begin[group[k]] if first else steps[k - 1]
     if _hop(steps[k], before, corexy) < least:
@@ -219,11 +219,11 @@ def assign_rates(
     feedrate: Array,
     predicted_s: Array,
 ) -> None:
-    """Feedrates (mm/min, as they will be printed) that reach every end at its time.
+    """Compute feedrates (mm/min, as printed) that reach every end on time.
 
     The firmware rounds the step rate up and the time of a step down to ticks; with junction
-    deviation a block that starts at the slower speed of the one before loses part of a step. What
-    is lost or won is carried to the next segment.
+    deviation a block that starts at the slower speed of the one before loses part of a step. Gains
+    and losses are carried over to the next segment.
 
     Parameters
     ----------
@@ -231,14 +231,13 @@ def assign_rates(
     foreign_s : ndarray, shape (n,)
         How long moves that are not ours take.
     correction_s : ndarray, shape (n,)
-        What a block takes longer than this law says.
+        Extra time of a block over this formula.
     instant : bool
         Every block starts at its own speed (classic jerk).
     timer_hz : float
         Of the step timer.
     least_hz : float
-        The slowest step rate that there is: what a creep or a stand would take longer is carried,
-        too.
+        Lowest step rate; the difference to slower motion or standstill is carried over too.
     start_s : float
     feedrate, predicted_s : ndarray, shape (n,)
         Filled.
@@ -255,7 +254,7 @@ def assign_rates(
             continue
         first = i == 0 or not ours[i - 1]
         if first:
-            # The stretch starts when its rest is over, whenever that is.
+            # The stretch starts when its rest is over.
             late = now + planned_s[i] - end_s[i]
         if steps[i] == 0.0:
             feedrate[i] = printed_feedrate(60.0 * fastest_mm_s[i])
@@ -266,7 +265,7 @@ def assign_rates(
         # Where it cannot keep up it may run after for a while, but must not fall to pieces.
         wanted = end_s[i] + late - now - correction_s[i]
         if first:
-            # From rest the first step takes up to 1/120 s: the stretch begins after it.
+            # The first step from rest takes up to 1/120 s: the stretch begins after it.
             wanted = planned_s[i]
         hurried = RUSH * path / planned_s[i] + RUSH_MM_S
         least = path / min(fastest_mm_s[i], hurried)
@@ -288,7 +287,7 @@ def assign_rates(
                 free = max((free + slow_s) / (1.0 + slow_steps / n), 0.5 * free)
             ticks = max(np.round(timer_hz * free / n), 1.0)
             ticks = min(ticks, np.floor(timer_hz / least_hz))
-            # A rate that gives these ticks, as near as can be to the one that is meant.
+            # Of the rates that give these ticks, the one nearest to the intended rate.
             lowest, highest = np.floor(timer_hz / (ticks + 1.0)) + 1.0, np.floor(timer_hz / ticks)
             rate = min(max(np.ceil(n / free), lowest), highest)
             lost = 0.0

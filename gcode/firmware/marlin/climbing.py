@@ -1,11 +1,11 @@
-"""Places the steps of Z in a stream that climbs, as in a vase.
+"""Place the steps of Z in a stream that climbs, as in a vase.
 
-The firmware moves Z by whole steps: one block climbs by a step, the ones around it do not. By
-junction deviation it takes that for a turn, at Z's acceleration; blocks on both sides are not
-slowed if each takes as long as Z needs for a step, sqrt(step / acceleration): 3.5 ms at 2.5 um and
-200 mm/s2. With classic jerk the step of Z's speed is within its jerk where the block that climbs
-takes step / jerk. So every step goes where moves are longest, within a step of where it belongs,
-and what is too short there is joined (`planner.cpp`, `_populate_block`; 2.0.8, 2.1.2.5).
+The firmware moves Z by whole steps: one block climbs by a step, its neighbours do not. Junction
+deviation treats that as a corner at Z's acceleration; the blocks on both sides are not slowed if
+each lasts as long as Z needs for a step, sqrt(step / acceleration): 3.5 ms at 2.5 um and 200 mm/s2.
+With classic jerk, Z's speed step is within its jerk if the climbing block lasts step / jerk. Every
+step is therefore put where moves are longest, within a step of its ideal place, and moves that are
+too short there are merged (`planner.cpp`, `_populate_block`; 2.0.8, 2.1.2.5).
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from stillpath.gcode.timeline import Timeline
 __all__ = ["climb_in_long_moves"]
 
 _DIP_STEPS = 0.5
-"""Steps of Z by which the fit of a climb may sink."""
+"""Steps of Z by which the fit of a climb may descend."""
 _SHARE = 0.7
-"""Moves with this share of the time that Z needs stay: slowing costs less than joining them."""
+"""Moves with this share of the time that Z needs are kept: merging would cost more."""
 
 
 def climb_in_long_moves(
@@ -45,13 +45,13 @@ def climb_in_long_moves(
     per_mm : float
         Steps of Z.
     limits : MarlinLimits
-        That the segments are executed under.
+        Limits of the segments.
     classic_jerk : bool
 
     Returns
     -------
     Segments
-        Stretches that climb by no step, or to and fro, stay as they are, and so do last vertices.
+        Unchanged: stretches that climb by no step, or up and down, and last vertices.
     """
     if classic_jerk:
         least_s = _SHARE / (per_mm * limits.jerk_z_mm_s), 0.0

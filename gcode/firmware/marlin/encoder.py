@@ -1,10 +1,10 @@
-"""Encodes a compensated command as the G1 lines that make Marlin execute it.
+"""Encode a compensated command as G1 lines that make Marlin execute it.
 
-Marlin moves in whole steps and times them in whole ticks. The vertices lie on whole steps, so that
-its rounding changes nothing, and far enough apart that it executes each; the feedrates are those of
-step rates that it can produce, and what a segment gains or loses is carried to the next. What the
-law misses is measured with the firmware's own planner and corrected. Linear advance is written into
-the filament (docs/marlin.md).
+Marlin moves in whole steps and times them in whole ticks. Vertices are on whole steps, so that its
+rounding changes nothing, and far enough apart that each is executed; feedrates correspond to step
+rates that it can produce, and the timing error of a segment is carried over to the next. Remaining
+deviations are measured with the firmware's own planner and corrected. Linear advance is written
+into the filament (docs/marlin.md).
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ __all__ = ["DEVIATION_MM", "STEEPEST", "MarlinEncoder", "stream_limits"]
 STEEPEST = 0.01
 """Steepest climb of a stream on top of the bed mesh's slope; Z's limits are raised for both."""
 STREAM_E_ACCEL_MM_S2 = 300_000.0
-"""So high that linear advance never limits X and Y, yet within the 32 bits of Marlin's
+"""High enough that linear advance never limits X and Y, but within the 32 bits of Marlin's
 acceleration_rate."""
 STREAM_MESH_ACCEL_MM_S2 = 20_000.0
 """Acceleration of Z where it follows a mesh: a step of 2.5 um in a third of a ms."""
@@ -71,7 +71,7 @@ _ROOM, _DIAGONAL = 1.05, 1.5
 """Speeds above the command's: of one axis, since vertices lie on whole steps, and of X and Y
 together along a diagonal."""
 _CALM = 0.6
-"""Share of the motors' permitted step of speed; making up for lost time needs the rest."""
+"""Share of the motors' permitted speed step; the rest is for making up lost time."""
 _PASSES = 10
 _TIME_TOLERANCE_S = 5e-5
 _BYTES_PER_LINE = 36.0
@@ -84,9 +84,9 @@ def stream_limits(
 ) -> MarlinLimits:
     """Return the limits of a stream where the file has set `own`.
 
-    X and Y keep what the motors bear, so that the stream may break off anywhere. Retractions are
-    not ours, so their acceleration stays. Linear advance is off, and the extruder may be as much
-    faster as the filament has to do for it.
+    X and Y have the motors' limits, so that the stream may be interrupted anywhere. Retractions
+    keep their acceleration. Linear advance is off, and the extruder's limit is raised by the speed
+    that it adds to the filament.
     """
     feed = 2.0 * own.feedrate_e_mm_s
     if own.linear_advance_k_s > 0.0:
@@ -133,7 +133,7 @@ class MarlinEncoder:
     ----------
     firmware : Marlin
     command : CommandLimits
-        What the motors bear.
+        Limits of the motors.
     corexy : bool
     mesh_slope : float
     travel_mm : sequence of (float, float), optional
@@ -161,7 +161,7 @@ class MarlinEncoder:
             rate = min(rate, firmware.baud_rate / 10.0 / _BYTES_PER_LINE)
         self._rate = rate
         self._least_hz = float(planner_facts(firmware, corexy=corexy)[C_MIN_RATE])
-        # With classic jerk a start has the jerk's speed, and no slow step.
+        # With classic jerk a move starts at the jerk's speed, without a slow first step.
         self._start_hz = self._least_hz if firmware.junction == "deviation" else np.inf
         self._burst = 0.5 * firmware.block_buffer_size
         low, high = steps_within(travel_mm, self._scale)
@@ -179,10 +179,10 @@ class MarlinEncoder:
         )
 
     grid_mm = 1e-3
-    """Much finer than a step, on which the encoder puts the vertices itself."""
+    """Much finer than a step; the encoder itself puts vertices on steps."""
 
     def rest_durations(self, piece: Piece, groups: Sequence[Group]) -> NDArray[np.float64]:
-        """First guess of the rests' durations: those of the original plan."""
+        """Return estimated durations of rests: those of the original plan."""
         return group_durations(piece.phases, groups)
 
     def encode(self, piece: Piece, timeline: Timeline, segments: Segments) -> Encoded:
@@ -191,14 +191,14 @@ class MarlinEncoder:
         Raises
         ------
         GcodeError
-            Where linear advance would drive the extruder faster than the firmware lets it.
+            If linear advance would exceed the extruder's speed limit.
         """
         own = cast(MarlinLimits, piece.limits_before)
         limits = stream_limits(own, self._command, self._mesh_slope)
         encoded, on_time = self._with_starts(piece, timeline, segments, limits, self._start_hz)
         if on_time:
             return encoded
-        # Better all of the motors' acceleration than a piece that is late.
+        # The motors' full acceleration is better than a late piece.
         return self._with_starts(piece, timeline, segments, limits, np.inf)[0]
 
     def _with_starts(
@@ -209,7 +209,7 @@ class MarlinEncoder:
         limits: MarlinLimits,
         least_hz: float,
     ) -> tuple[Encoded, bool]:
-        """Encode for starts from rest at a step rate; tell whether the motion keeps up."""
+        """Encode for starts from rest at a step rate; return also whether the motion keeps up."""
         on_steps = self._on_steps(timeline, segments, limits, least_hz)
         segments = self._advanced(piece, timeline, on_steps)
         moves = interleave(piece, timeline, segments, 1)
@@ -245,7 +245,7 @@ class MarlinEncoder:
         limits_id: NDArray[np.int32],
         limits: Sequence[Limits],
     ) -> tuple[NDArray[np.float64], Phases]:
-        """Feedrates that keep the times of the segments, and the firmware's plan of them."""
+        """Return feedrates that keep the segments' times, and the firmware's plan of them."""
         ours, places = moves.row < 0, moves.places_mm()
         start_mm, end_mm = places[:-1], places[1:]
         steps, path = self._blocks(start_mm, end_mm)
@@ -272,15 +272,15 @@ class MarlinEncoder:
             miss = actual - predicted
             if np.max(np.abs(np.cumsum(miss)), initial=0.0) < _TIME_TOLERANCE_S:
                 break
-            # Rates have steps: a full correction would swing to and fro.
+            # Rates are quantised: a full correction would oscillate.
             correction[ours] += miss[ours] * (1.0 if attempt == 0 else 0.7)
         return feedrate, phases
 
     def _advanced(self, piece: Piece, timeline: Timeline, segments: Segments) -> Segments:
-        """Segments with linear advance in their filament.
+        """Return segments with linear advance in their filament.
 
-        The firmware's own would be lost: it adds and takes back steps during a block's ramps, and
-        those of a stream last a part of a step.
+        The firmware's own would be lost: it acts during a block's ramps, and those of a stream last
+        a fraction of a step.
         """
         limits = cast(list[MarlinLimits], piece.limits)
         k_s = np.array([x.linear_advance_k_s for x in limits])
@@ -303,8 +303,8 @@ class MarlinEncoder:
             timeline.start_s,
             lead_mm,
         )
-        # Where E leads the steps, times depend on how it is rounded, and a stream counts E from
-        # anywhere: so it takes whole steps, as X and Y do.
+        # Where E has the most steps, times depend on its rounding, and a stream may start at any E:
+        # so E is put on whole steps, like X and Y.
         begin_mm = timeline.group_start_mm[segments.group, 3]
         per_mm = self._scale[3]
         whole_mm = begin_mm + np.round((end_mm[3] + lead_mm - begin_mm) * per_mm) / per_mm
@@ -314,9 +314,9 @@ class MarlinEncoder:
     def _where_the_file_says(
         self, piece: Piece, timeline: Timeline, moves: Interleaved
     ) -> Interleaved:
-        """Let stretches begin and end, and rests go, where the file says and not on steps.
+        """Return moves with ends of stretches, and rests, at the file's positions, not on steps.
 
-        The firmware comes to the same steps, and filament adds up to the last digit.
+        The firmware rounds them to the same steps, and filament adds up exactly.
         """
         own = piece.moves.end_mm
         position = moves.position.copy()
@@ -369,7 +369,7 @@ class MarlinEncoder:
     def _blocks(
         self, start_mm: NDArray[np.float64], end_mm: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Step events and length of the block of every move, as the planner makes it."""
+        """Return step events and length of every move's block, as in the planner."""
         travel = np.round(end_mm * self._scale) - np.round(start_mm * self._scale)
         x_mm, y_mm, z_mm, e_mm = (travel / self._scale).T
         motors = np.abs(travel)
@@ -397,7 +397,7 @@ class MarlinEncoder:
 
 
 def _begun_late(encoded: Encoded, moves: Interleaved, timeline: Timeline) -> Encoded:
-    """Begin stretches later by what their first step from rest takes too long."""
+    """Begin stretches later by the extra time of their first step from rest."""
     ours, phases = moves.row < 0, encoded.phases
     first = ours & np.append(True, ~ours)[:-1]
     delay_s = np.zeros(len(timeline.groups))
@@ -411,7 +411,7 @@ def _begun_late(encoded: Encoded, moves: Interleaved, timeline: Timeline) -> Enc
 
 
 def _check_advance(piece: Piece, k_s: NDArray[np.float64], fastest: NDArray[np.float64]) -> None:
-    """Refuse moves that the firmware would slow down for linear advance and the plan does not."""
+    """Refuse moves that the firmware, but not the plan, would slow down for linear advance."""
     limits = cast(list[MarlinLimits], piece.limits)
     own = np.array([(x.accel_x_mm_s2, x.accel_y_mm_s2, x.print_accel_mm_s2) for x in limits])
     which, direction = piece.moves.limits_id, piece.phases.direction

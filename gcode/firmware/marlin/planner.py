@@ -1,8 +1,8 @@
 """Marlin's planner: from moves to blocks of whole steps and their trapezoids.
 
-`Planner` gives the same for any cutting of the stream. It takes the file to be read faster than
-it is executed, so the firmware's queue is full but for the first blocks after a stop. The rules
-stand in `_block_kernels` (speeds, accelerations and junctions of a block) and `_planner_kernels`
+The result of `Planner` does not depend on how the stream is divided. It assumes that the file is
+read faster than executed, so the firmware's queue is full except right after a stop. The rules are
+in `_block_kernels` (speeds, accelerations and junctions of a block) and `_planner_kernels`
 (look-ahead, trapezoids, step timing); sources: docs/marlin.md.
 """
 
@@ -110,7 +110,7 @@ class Planner(QueuePlanner):
 
 
 def planner_facts(firmware: Marlin, *, corexy: bool) -> NDArray[np.float64]:
-    """Return the machine's facts as the kernels take them (``C_`` entries)."""
+    """Return the machine's facts in the kernels' order (``C_`` entries)."""
     facts = np.zeros(blocks.C_SIZE)
     scale = firmware.steps_per_mm
     facts[blocks.C_STEPS_PER_MM : blocks.C_STEPS_PER_MM + 4] = scale.x, scale.y, scale.z, scale.e

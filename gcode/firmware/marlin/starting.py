@@ -1,9 +1,9 @@
-"""Which acceleration each line of a stream runs under, so that the motors bear a start from rest.
+"""Choose the acceleration of each line of a stream so that motors can start from rest.
 
-The first step from rest lasts as long as the least step rate lets it, and the second has the rate
-that the acceleration reaches meanwhile, up to the line's own (docs/marlin.md). So a line that is
-no faster than a motor's step of speed may start under any acceleration; a faster one gets as
-little as its place in the motion allows.
+The first step from rest lasts as long as the lowest step rate implies, and the second has the rate
+that the acceleration has reached by then, up to the line's own (docs/marlin.md). A line no faster
+than a motor's permitted speed step may therefore start under any acceleration; a faster one gets
+the lowest acceleration that the motion around it allows.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ from stillpath.models.machine import CommandLimits
 __all__ = ["StreamLevels", "gentle_accel_mm_s2"]
 
 _WITHIN_S = 1e-3
-"""In which a motor bears its step of speed."""
+"""Time in which a motor can follow its speed step."""
 _RUNGS = (1.0, 1.1, 1.25, 1.5, 2.0, 3.0)
-"""Accelerations that are tried, of the one that makes a gentle start; then comes the stream's."""
+"""Levels tried, as multiples of the gentle acceleration; the last level is the stream's own."""
 _ROOM = 1.1
-"""Of what a line needs by the speeds around it."""
+"""Margin on the acceleration that a line needs for the speeds around it."""
 _TRIES = 8
-"""Plans that are looked at; the last two give the most acceleration where one is late."""
+"""Number of plans tried; in the last two, late lines get the full acceleration."""
 _BEHIND_MM, _TRAVEL_BEHIND_MM = 0.02, 0.06
-"""Where the motion falls behind by that, with filament or without, acceleration is too low."""
+"""Lag, with and without filament, from which acceleration counts as too low."""
 _BEHIND = 3
-"""Lines before a late one that may be the reason."""
+"""Number of lines before a late one that may have caused it."""
 
 
 def gentle_accel_mm_s2(bears: CommandLimits, least_hz: float) -> float:
-    """Return the acceleration from which a start from rest is a step of speed that a motor bears.
+    """Return the largest acceleration with which a motor can follow a start from rest.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ class StreamLevels:
     least_hz : float
         The least step rate, which a start from rest begins with.
     ahead : int
-        How many lines the firmware knows when one begins, that one included.
+        Number of lines in the firmware's queue when one begins, including that one.
     corexy : bool
 
     Attributes
@@ -103,7 +103,7 @@ class StreamLevels:
         self.level = self._spread()
 
     def raise_late(self, phases: Phases) -> NDArray[np.bool_]:
-        """Give more acceleration where the plan comes late; return which lines have got it.
+        """Raise the acceleration where the plan is late; return the changed lines.
 
         Parameters
         ----------
@@ -122,11 +122,11 @@ class StreamLevels:
         return around
 
     def keep_up(self, phases: Phases) -> bool:
-        """Tell whether a plan is not behind by more than twice what is looked at."""
+        """Return whether a plan is late by at most twice the limit."""
         return bool(np.all(self._behind(phases) < 2.0))
 
     def _behind(self, phases: Phases) -> NDArray[np.float64]:
-        """How far lines end behind where they should, over what is too far, shape (n,)."""
+        """Return the lag of each line's end relative to the limit, shape (n,)."""
         ours = self._ours
         first = ours & np.append(True, ~ours)[:-1]
         lasts_s = phases.lasts_s
@@ -139,7 +139,7 @@ class StreamLevels:
     def _to_stop(
         self, motors: NDArray[np.float64], span_s: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Acceleration with which the lines that the firmware knows suffice to stop in."""
+        """Return the acceleration that allows a stop within the lines in the firmware's queue."""
         size = np.abs(motors).max(axis=1)
         n, known = len(size), self._ahead - 1
         passed = np.append(0.0, np.cumsum(size))
@@ -154,7 +154,7 @@ class StreamLevels:
         return needed
 
     def _spread(self) -> NDArray[np.int64]:
-        """Levels of all lines: what they need, and slow ones no less than those before them."""
+        """Return the levels of all lines: as needed, slow lines no lower than the one before."""
         level = self._least.copy()
         now = 0
         for i in np.flatnonzero(self._ours).tolist():
@@ -171,7 +171,7 @@ def _needed(
     gentle: NDArray[np.float64],
     deviation_mm: float,
 ) -> NDArray[np.float64]:
-    """Acceleration that each line needs to have its speed, over the gentle one.
+    """Return the acceleration that each line needs for its speed, relative to the gentle one.
 
     A line speeds up within itself, and brakes within itself for the next; what turns at its begin
     is borne like the curve that short moves are part of, or by junction deviation.

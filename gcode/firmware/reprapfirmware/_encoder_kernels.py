@@ -1,4 +1,4 @@
-"""Loops of the RepRapFirmware encoder: speeds that land on time, segments that the queue can take.
+"""Kernels of the RepRapFirmware encoder: speeds that end on time, segments within the queue.
 
 Rules of the times: src/Movement/DDA.cpp RecalculateMove, 3.6.0-beta.2, 2024-11.
 """
@@ -16,7 +16,7 @@ from stillpath.models.jit import kernel
 __all__ = ["assign_speeds", "keep_apart"]
 
 RUSH = 0.5
-"""No segment is hurried to less than this part of its planned time."""
+"""Shortest time of a segment relative to its planned one."""
 _ROUNDS = 4
 _OVER, _UNDER = 1.05, 1.5
 """Shares of the band in which a peak is cut off."""
@@ -34,20 +34,19 @@ def assign_speeds(
     feedrate: NDArray[np.float64],
     predicted_s: NDArray[np.float64],
 ) -> None:
-    """Feedrates (mm/min, as they will be printed) that reach every end at its time.
+    """Compute feedrates (mm/min, as printed) that reach every end on time.
 
     Moves with `ours` false have their own speed: `allowed.speed_mm_s` is that, and the highest
-    speed of ours. How long a move takes depends on
-    the speed of the next one, so it is settled together with that. A stretch starts when the rest
-    before it is over: its times move with that.
+    speed of ours. The duration of a move depends on the speed of the next one, so both are chosen
+    together. A stretch starts when the rest before it is over, and its times shift accordingly.
 
-    Low peaks of speed are cut off by the firmware. Where that would cost more way than to give a
-    move the speed of a neighbour, it gets that.
+    The firmware cuts off low peaks of speed. If that would cost more distance than giving a move
+    the speed of a neighbour, it gets that.
 
     Parameters
     ----------
     missed_s : ndarray
-        How much longer each move took than foreseen, when it was planned before.
+        Extra time of each move over the prediction in the previous pass.
     clock_hz : float
         Of the motors' steps. Phases last whole clocks; rounded by themselves, those of a long
         stretch would add up to some tenths of a ms.
@@ -122,7 +121,7 @@ def assign_speeds(
             begin += lasts
         if ours[i]:
             feedrate[i] = printed_feedrate(60.0 * v)
-            # What could not be caught up is not owed any more.
+            # Time that could not be caught up is written off.
             late = max(late, begin + RUSH * planned_s[i] - end_s[i])
         before, enter_before = v, enter
     if count:
@@ -133,13 +132,13 @@ def assign_speeds(
 
 @kernel(inline=True)
 def _lost(speed: float, side: float, band: float) -> float:
-    """How much of its speed a peak loses that stands out of its higher neighbour by too little."""
+    """Return the speed lost by a peak that exceeds its higher neighbour by too little."""
     return speed - side if side < speed < side + band and side >= 0.9 * speed else 0.0
 
 
 @kernel
 def _speed(length: float, lasts_s: float, enter: float, accel: float) -> float:
-    """Speed to reach in a move that begins with at most `enter` and shall last so long."""
+    """Return the speed of a move of given duration that begins with at most `enter`."""
     even = length / lasts_s
     if even <= enter:
         return even
@@ -152,7 +151,7 @@ def _speed(length: float, lasts_s: float, enter: float, accel: float) -> float:
 def _lasts_s(
     length: float, enter: float, leave: float, speed: float, accel: float, clock_hz: float
 ) -> float:
-    """Time of a move between the speeds at its ends: whole clocks for each phase."""
+    """Return the duration of a move between given end speeds, in whole clocks per phase."""
     up = (speed * speed - enter * enter) / (2.0 * accel)
     down = (speed * speed - leave * leave) / (2.0 * accel)
     top = speed

@@ -1,9 +1,9 @@
-"""Encodes a compensated command as the G1 lines that make RepRapFirmware execute it.
+"""Encode a compensated command as G1 lines that make RepRapFirmware execute it.
 
-The speed along the path is continuous in this firmware: a step of it costs time, a step of
-direction costs none within the jerk limits. The stream runs under what the motors bear, so that it
-may break off at any line; what ramps cost is foreseen to the clock. Places are whole motor steps,
-chosen by the printer's response. Pressure advance is written into the filament
+The speed along the path is continuous in this firmware: a change of it costs time, a change of
+direction costs none within the jerk limits. The stream runs under the motors' limits, so that it
+may be interrupted at any line; the time of ramps is predicted to the clock. Vertices are on whole
+motor steps, chosen by the printer's response. Pressure advance is written into the filament
 (docs/reprapfirmware.md).
 """
 
@@ -44,7 +44,7 @@ __all__ = ["STEEPEST", "RepRapEncoder", "stream_limits"]
 STEEPEST = 0.01
 """Steepest climb of a stream on top of the bed mesh's slope; Z's limits are raised for both."""
 STREAM_E_ACCEL_MM_S2 = 60_000.0
-"""So high that pressure advance never limits X and Y."""
+"""High enough that pressure advance never limits X and Y."""
 _CORNER, _RAMP = 0.47, 0.375
 """Shares of the motors' permitted step of speed: for a corner, and for a ramp of 1 ms on CoreXY."""
 LEAST_SPEED_MM_S = 0.01
@@ -53,13 +53,13 @@ _E_JERK_SHARE = 2.0
 """Multiple of the extruder's own jerk: between acceleration and deceleration the firmware's own
 pressure advance steps by twice the jerk."""
 _DIAGONAL = 1.5
-"""How much faster than the path a CoreXY motor may run, and how much more Z's direction changes."""
+"""Ratio of a CoreXY motor's speed to the path's, and of the changes of Z's direction."""
 _PASSES = 4
 _EXACT_S = 2e-6
 _POLL_S = 2e-3
-"""The firmware looks every 2 ms whether moves are to be frozen."""
+"""The firmware checks every 2 ms whether moves are to be frozen."""
 _SPARSE = 1.3
-"""Half a ring is planned to last this much longer than the firmware needs."""
+"""Planned duration of half a ring relative to what the firmware needs."""
 _SLOW_MM_S, _SLOW_MM = 10.0, 0.1
 """Segments slower than this are at most this long, unless their neighbours are as fast: a peak of
 speed of less than a tenth is cut off, which costs up to a tenth of the segment's length."""
@@ -127,7 +127,7 @@ class RepRapEncoder:
     """
 
     grid_mm = 1e-3
-    """Much finer than a step, on which the encoder puts the vertices itself."""
+    """Much finer than a step; the encoder itself puts vertices on steps."""
 
     def __init__(
         self,
@@ -140,7 +140,7 @@ class RepRapEncoder:
         self._kinematics = kinematics
         self._half_ring = firmware.ring_length // 2 - 1
         self._half_ring_s = firmware.prepare_least_s + _POLL_S
-        """What so many moves must last, or the firmware freezes the next one too late."""
+        """Least duration of that many moves, so that the firmware freezes the next one in time."""
         self._limits = limits
         per_mm = np.array([drive.steps_per_mm for drive in firmware.drives])
         low, high = steps_within(travel_mm, per_mm)
@@ -158,7 +158,7 @@ class RepRapEncoder:
         )
 
     def rest_durations(self, piece: Piece, groups: Sequence[Group]) -> NDArray[np.float64]:
-        """First guess of the rests' durations: those of the original plan."""
+        """Return estimated durations of rests: those of the original plan."""
         return group_durations(piece.phases, groups)
 
     def encode(self, piece: Piece, timeline: Timeline, segments: Segments) -> Encoded:
@@ -167,7 +167,7 @@ class RepRapEncoder:
         Raises
         ------
         GcodeError
-            When the segments come faster than the firmware's queue can take them.
+            If segments come faster than the firmware's queue can take them.
         """
         segments = self._sparse(timeline, _split_slow(timeline, segments))
         segments = self._sparse(timeline, self._on_steps(timeline, segments))
@@ -191,8 +191,8 @@ class RepRapEncoder:
             written = as_moves(start_mm, end_mm, chosen, limits_id)
             planner = RepRapPlanner(self._firmware, self._kinematics)
             phases = planner.plan_whole(written, limits)
-            # Rests, whose moves brake for what comes later, are foreseen a little wrong; and a peak
-            # of speed that is nearly cut off may be or not be, whatever was foreseen.
+            # The prediction is slightly off for rests, whose moves brake for later ones, and for
+            # speed peaks that are almost cut off.
             miss = phases.lasts_s - predicted
             wrong_s = float(np.max(np.abs(np.cumsum(miss)), initial=0.0))
             if wrong_s < least_s:
@@ -204,7 +204,7 @@ class RepRapEncoder:
         return encoded_piece(timeline, moves, self._limits, best, plan)
 
     def _sparse(self, timeline: Timeline, segments: Segments) -> Segments:
-        """Leave out ends where segments come faster than the firmware's queue can take them."""
+        """Drop vertices where segments come faster than the firmware's queue can take them."""
         half = self._half_ring
         if len(segments) < half:
             return segments
@@ -226,7 +226,7 @@ class RepRapEncoder:
         )
 
     def _advanced(self, piece: Piece, timeline: Timeline, segments: Segments) -> Segments:
-        """Segments with pressure advance in their filament."""
+        """Return segments with pressure advance in their filament."""
         end_mm = segments.end_mm.copy()
         rows, fed, _ = feed_at_ends(piece, timeline, segments)
         advance_s = np.array([x.pressure_advance_s for x in cast(list[RepRapLimits], piece.limits)])
@@ -237,8 +237,8 @@ class RepRapEncoder:
     def _on_steps(self, timeline: Timeline, segments: Segments) -> Segments:
         """Put the vertices on whole steps of X and Y.
 
-        Not of Z: the firmware limits speeds at corners by directions as they are written, and a
-        slow climb, a vase's, in steps is flat and then too steep.
+        Not of Z: the firmware limits corner speeds by the directions as written, and in steps a
+        slow climb, as in a vase, would be flat and then too steep.
         """
         if len(segments) == 0:
             return segments
@@ -251,7 +251,7 @@ class RepRapEncoder:
         limits_id: NDArray[np.int32],
         limits: Sequence[Limits],
     ) -> MoveLimits:
-        """Return what is allowed to every move, by the rules of the planner."""
+        """Return the limits of every move by the planner's rules."""
         own = np.array([x.as_row() for x in limits])[limits_id]
         travel = end_mm - start_mm
         length = np.sqrt(np.sum(travel[:, :3] ** 2, axis=1))
@@ -297,7 +297,7 @@ class RepRapEncoder:
 def _starts(
     timeline: Timeline, segments: Segments
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """When, shape (n,), and where, shape (4, n), segments begin."""
+    """Return times, shape (n,), and positions, shape (4, n), at which segments begin."""
     fresh = np.append(True, segments.final[:-1])
     start_s = np.where(fresh, timeline.start_s[segments.group], np.roll(segments.end_s, 1))
     start_mm = np.roll(segments.end_mm, 1, axis=1)
@@ -306,7 +306,7 @@ def _starts(
 
 
 def _split_slow(timeline: Timeline, segments: Segments) -> Segments:
-    """Cut slow segments whose neighbours have other speeds into short even parts."""
+    """Split slow segments whose neighbours have other speeds into short equal parts."""
     if len(segments) == 0:
         return segments
     start_s, start_mm = _starts(timeline, segments)

@@ -18,7 +18,7 @@ _NEXT, _FINE, _OFTEN = 0.02, 3, 20
 """Saturation: the share of the range beside an extreme that is examined, the sensor steps that it
 must contain, and the most samples that may lie at the extreme."""
 _GAP_SAMPLES = 2.5
-"""Two periods are one lost sample, which is let pass; half a period allows for jitter."""
+"""Two periods are one lost sample, which is accepted; half a period allows for jitter."""
 
 
 def check_long(table: Table, least: int, what: str, most: int | None = None) -> None:

@@ -1,4 +1,4 @@
-"""Facts that measurement files lack: asked for, or assumed by the date of the firmware."""
+"""Facts that measurement files lack: set by the user, or assumed from the firmware's date."""
 
 from __future__ import annotations
 
