@@ -8,6 +8,7 @@ import tempfile
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from tests.missing import tell
 from tests.nginx import MISSING as _NO_NGINX
@@ -24,6 +25,10 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 # As in `service/environment.py`: modules, kernels and tests are very many objects that stay, and
 # looking through them for cycles whenever 700 have come took a quarter of all time.
 gc.set_threshold(50_000)
+
+# A busy computer is no fault of the code.
+settings.register_profile("patient", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("patient")
 
 _NO_SMALL_DISK = "no small disk"
 _MISSING = "no shared test data: set STILLPATH_SHARED, or put the folder beside the checkout"
