@@ -15,10 +15,10 @@ from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
 from scipy.interpolate import CubicSpline
 
 from stillpath.models.errors import ModelError
-from stillpath.models.identification.excitation import VelocityProfile, regenerate
-from stillpath.models.identification.types import AccelerationLog, Excitation
+from stillpath.models.identification.excitation import VelocityProfile, klipper_psd, regenerate
+from stillpath.models.identification.types import AccelerationLog, Excitation, Spectrum
 
-__all__ = ["AlignedLog", "align", "check_pair", "resample"]
+__all__ = ["AlignedLog", "align", "check_pair", "resample", "spectrum_along"]
 
 Array = NDArray[np.float64]
 
@@ -29,6 +29,7 @@ _APART_S = 2.0  # beyond the side lobes of one peak
 _LEAST_FRACTION = 0.95  # of the sweep, before a cut log is refused
 _LATEST_START_S = 0.6  # half a second, plus delays of sensor, plant and time stamps
 _LEAD_S = 0.5
+_TABLE_HZ = 200.0  # where Klipper ends a table
 _CROSS = 0.2  # of the power along the axis
 _LEAST_COSINE = 0.7  # 45 degrees: nearer to this axis than to another
 
@@ -61,6 +62,14 @@ class AlignedLog:
     direction: Array
     correlation: float
     notes: tuple[str, ...] = ()
+
+
+def spectrum_along(aligned: AlignedLog, log: AccelerationLog, column: str) -> Spectrum:
+    """Return the spectrum of an aligned log along its axis, as Klipper computes tables."""
+    time_s = np.arange(len(aligned.measured_mm_s2)) / aligned.rate_hz
+    f_hz, psd = klipper_psd(time_s, aligned.measured_mm_s2)
+    told = f_hz <= _TABLE_HZ
+    return Spectrum(f_hz[told], {column: psd[told]}, axis=log.axis, source=log.source)
 
 
 def align(

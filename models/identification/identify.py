@@ -11,7 +11,12 @@ from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias
 
 from stillpath.models.errors import ModelError
-from stillpath.models.identification.alignment import AlignedLog, align, check_pair
+from stillpath.models.identification.alignment import (
+    AlignedLog,
+    align,
+    check_pair,
+    spectrum_along,
+)
 from stillpath.models.identification.averaging import mean_response, mean_spectrum
 from stillpath.models.identification.conditioned import scheduled, special, usual
 from stillpath.models.identification.conditions import Condition
@@ -30,6 +35,8 @@ from stillpath.models.identification.messages import (
     mounting_notes,
     no_frame_note,
     parted,
+    phase_warning,
+    poorly_explained,
     scale_warnings,
 )
 from stillpath.models.identification.modal_fit import refit
@@ -59,6 +66,7 @@ from stillpath.models.identification.types import (
     AxisIdentification,
     DrivenLog,
     Excitation,
+    Fit,
     FrequencyResponse,
     Measurement,
     PlantModel,
@@ -192,15 +200,7 @@ class _AxisWork:
         if self._kind != "spectrum":
             return None
         self._spectra = [self._spectrum(one) for one in self._used]
-        common = usual([c for _, _, c in self._spectra], self._axis)
-        chosen = [(s, e) for s, e, c in self._spectra if c in common]
-        self._explanations = explanations(
-            [s for s, _ in chosen],
-            [e for _, e in chosen],
-            column=self._settings.sensor_axis,
-            max_order=self._max_order,
-            progress=self._steps.within(f"axis {self._axis}: fitting"),
-        )
+        self._explanations = self._explained()
         return self._explanations.frame_hz
 
     def identified(self, frame_likely: float) -> AxisIdentification:
@@ -217,6 +217,8 @@ class _AxisWork:
             found = self._from_spectra(frame_likely)
         else:
             found = self._from_responses()
+            if self._kind == "raw log" and found.fit and poorly_explained(found.fit):
+                found = self._from_magnitudes(found.fit, frame_likely)
         self._steps.stepped(f"axis {self._axis}: fitted")
         notes = list(found.notes)
         used = [one.measurement for one in self._used]
@@ -323,7 +325,35 @@ class _AxisWork:
         }
         others = tuple(s for s, _, c in spectra if c not in common)
         found = replace(found, measured=(*found.measured, *others), notes=tuple(by_file(notes)))
-        return scheduled(found, nominal, fits, self._kind)
+        return scheduled(found, nominal, fits, "spectrum")
+
+    def _from_magnitudes(self, poor: Fit, frame_likely: float) -> AxisIdentification:
+        """Return the axis from spectra of its logs, whose phase no model explains."""
+        column = self._settings.sensor_axis or self._axis
+        self._spectra = [
+            (
+                spectrum_along(aligned, log, column),
+                excitation_for(log, self._settings),
+                one.condition,
+            )
+            for aligned, one in zip(self._aligned, self._used, strict=True)
+            if isinstance(log := one.measurement, AccelerationLog)
+        ]
+        self._explanations = self._explained()
+        found = self._from_spectra(frame_likely)
+        return replace(found, warnings=(*found.warnings, phase_warning(self._axis, poor)))
+
+    def _explained(self) -> Explanations:
+        """Return what explains the spectra without a condition of their own."""
+        common = usual([c for _, _, c in self._spectra], self._axis)
+        chosen = [(s, e) for s, e, c in self._spectra if c in common]
+        return explanations(
+            [s for s, _ in chosen],
+            [e for _, e in chosen],
+            column=self._settings.sensor_axis,
+            max_order=self._max_order,
+            progress=self._steps.within(f"axis {self._axis}: fitting"),
+        )
 
     def _response(self, one: Measured) -> FrequencyResponse:
         measurement, label = one.measurement, one.condition.label

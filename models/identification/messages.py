@@ -139,6 +139,22 @@ def fit_warnings(fit: Fit, sources: Sequence[str]) -> tuple[str, ...]:
     return ()
 
 
+def poorly_explained(fit: Fit) -> bool:
+    """Return whether a model misses much of a response, but is not none at all."""
+    return not fit.magnitude_only and _POOR < fit.residual <= _USELESS
+
+
+def phase_warning(axis: str, poor: Fit) -> str:
+    """Say why of logs only the magnitude is used."""
+    return (
+        f"axis {axis.upper()}: the best model misses {poor.residual:.0%} of what the logs say, "
+        f"{_POOR:.0%} at most is to be expected: how the axis moves depends on how far it moves "
+        "(much friction, play). So only the size of the vibrations is used, as from a resonance "
+        "table, and the compensation is more cautious. Look for what rubs or is loose, and measure "
+        "again"
+    )
+
+
 def level_warnings(responses: Sequence[FrequencyResponse], fit: Fit) -> list[str]:
     """Judge the level by the fit, where nothing followed at the frequencies that tell it."""
     names = ", ".join(r.source for r in responses if plateau_gain(r) is None)

@@ -24,6 +24,7 @@ from stillpath.models.identification.mode_estimates import (
     robust_covariance,
     with_floor,
 )
+from stillpath.models.identification.prompt import delay_of, prompt
 from stillpath.models.identification.response_candidate import (
     Candidate,
     delay_span,
@@ -32,6 +33,7 @@ from stillpath.models.identification.response_candidate import (
     with_gain,
 )
 from stillpath.models.identification.response_data import ResponseData, response_data
+from stillpath.models.identification.trust import main_mode_known
 from stillpath.models.identification.types import Fit, FrequencyResponse, ModeEstimate, OrderTrial
 from stillpath.models.plants import PairsSpec, RelativeModesSpec, frequency_response
 
@@ -66,20 +68,25 @@ def fit_modes(
     Parameters and errors as of `fitting.fit_response`.
     """
     single = measured if isinstance(measured, FrequencyResponse) else mean_response(measured)
-    pairs = fit_response(single, max_order=max_order, progress=progress)
     data = response_data(single)
+    fitted = fit_response(single, max_order=max_order, progress=progress)
+    pairs = _as_used(data, fitted)
     found = _orders(data, pairs, max_order)
     if not found:
         return pairs
-    chosen = found[0]
-    for larger in found[1:]:
-        clearly = larger.nrmse < _CLEARLY * chosen.nrmse
-        if chosen.nrmse > _enough(data, pairs.residual) and clearly:
-            chosen = larger
-    if chosen.nrmse > _enough(data, pairs.residual):
-        return pairs
     trials = tuple(OrderTrial(c.structure.modes, c.nrmse) for c in found)
-    return replace(_as_fit(data, chosen), trials=trials)
+    modes = [replace(_as_used(data, _as_fit(data, c)), trials=trials) for c in found]
+    # Modes that cancel each other explain much, and nobody knows where they are.
+    modes = [fit for fit in modes if main_mode_known(fit)] or modes
+    # Pairs whose slow motion is late by much explain a response, but are not used as fitted.
+    least = min(pairs.residual, max(fitted.residual, min(fit.residual for fit in modes)))
+    enough = _enough(data, least)
+    chosen = modes[0]
+    for larger in modes[1:]:
+        if chosen.residual > enough and larger.residual < _CLEARLY * chosen.residual:
+            chosen = larger
+    explained = chosen.residual <= max(enough, pairs.residual)
+    return chosen if explained or not main_mode_known(pairs) else pairs
 
 
 def refit(measured: FrequencyResponse, like: Fit) -> Fit:
@@ -91,7 +98,7 @@ def refit(measured: FrequencyResponse, like: Fit) -> Fit:
         If too few points are left to fit.
     """
     if isinstance(like.spec, PairsSpec):
-        return refit_response(measured, like)
+        return _as_used(response_data(measured), refit_response(measured, like))
     if not isinstance(like.spec, RelativeModesSpec):
         raise ModelError("a plant of modes or pairs is needed to start from; fit a response first")
     data = response_data(measured)
@@ -100,7 +107,8 @@ def refit(measured: FrequencyResponse, like: Fit) -> Fit:
     ratio = data.response / structure.response(theta, data.f_hz)
     start = with_gain(data, structure, theta, low_frequency_delay(data.f_hz, ratio))
     fitted = _polished(data, start, _least_damping(data, start))
-    return replace(_as_fit(data, fitted), trials=(OrderTrial(structure.modes, fitted.nrmse),))
+    fit = _as_used(data, _as_fit(data, fitted))
+    return replace(fit, trials=(OrderTrial(structure.modes, fitted.nrmse),))
 
 
 def alternatives(measured: FrequencyResponse, fit: Fit) -> tuple[Fit, ...]:
@@ -117,6 +125,17 @@ def alternatives(measured: FrequencyResponse, fit: Fit) -> tuple[Fit, ...]:
         starts.append(of_poles(data, [(m.f_hz, m.zeta) for m in kept]))
     tried = [_calm(data, _polished(data, s)) for s in starts if s is not None]
     return tuple(_as_fit(data, t) for t in tried if t.nrmse <= enough and _all_ring(t))
+
+
+def _as_used(data: ResponseData, fit: Fit) -> Fit:
+    """Return the fit with the residual of the plant that is made of it, slow motion on time.
+
+    For a delay of some milliseconds, which is the clock's, that is another plant (`prompt`).
+    """
+    turned = np.exp(-2j * np.pi * data.f_hz * (fit.delay_s + delay_of(fit.spec)))
+    model = fit.gain * turned * frequency_response(prompt(fit), data.f_hz)
+    missed = np.linalg.norm(model - data.response) / np.linalg.norm(data.response)
+    return replace(fit, residual=max(fit.residual, float(missed)))
 
 
 def _all_ring(fit: Modal) -> bool:

@@ -15,7 +15,7 @@ from stillpath.models.identification.types import (
     Spectrum,
 )
 
-__all__ = ["check_axes", "check_informative", "keeps_time"]
+__all__ = ["check_axes", "check_informative", "keeps_time", "main_mode_known"]
 
 _LEAST_SHARE, _LEAST_COUNT = 0.1, 30
 _PRINTERS_HZ = 150.0
@@ -68,13 +68,18 @@ def check_informative(
             + _MEASURE
         )
     # Modes of a spectrum trade places with each other; its set knows how far it can be trusted.
-    unsure = np.isfinite(main.f_sd_hz) and main.f_sd_hz > _MOST_UNSURE * main.f_hz
-    if unsure and not fit.magnitude_only:
+    if not fit.magnitude_only and not main_mode_known(fit):
         raise ModelError(
             f"{names}: the mode that rings most is at {main.f_hz:.1f} Hz, give or take "
             f"{2 * main.f_sd_hz:.1f} Hz; it must be known within {2 * _MOST_UNSURE:.0%} to be "
             f"compensated. {_MEASURE}"
         )
+
+
+def main_mode_known(fit: Fit) -> bool:
+    """Return whether the mode that rings most is known closely enough to be compensated."""
+    main = max(fit.modes, key=lambda mode: mode.peak, default=None)
+    return main is None or not main.f_sd_hz > _MOST_UNSURE * main.f_hz or np.isinf(main.f_sd_hz)
 
 
 def check_axes(found: Sequence[AxisIdentification]) -> None:

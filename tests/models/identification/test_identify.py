@@ -14,9 +14,12 @@ from stillpath.applications.identification.run import InputFile
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.conditions import Condition
 from stillpath.models.identification.identify import Measured, identify
+from stillpath.models.identification.modal_fit import fit_modes
+from stillpath.models.identification.prompt import prompt
 from stillpath.models.identification.readers import ReadSettings, read_content
 from stillpath.models.identification.synthetic import Sensor
 from stillpath.models.identification.types import (
+    AccelerationLog,
     AxisIdentification,
     FrequencyResponse,
     Measurement,
@@ -508,3 +511,35 @@ def test_what_no_model_explains_is_refused() -> None:
     )
     with pytest.raises(ModelError, match=r"noise.csv: no stable model .* explains this"):
         identify([Measured(response)])
+
+
+def late_by_less(log: AccelerationLog, plant: PairsSpec, share: float) -> AccelerationLog:
+    """Return the log of an axis whose phase is only a share of its plant's, as under friction."""
+    accel = np.array(log.accel_mm_s2)
+    f_hz = np.fft.rfftfreq(len(accel), float(np.median(np.diff(log.time_s))))
+    turned = np.exp(1j * (share - 1) * np.angle(frequency_response(plant, f_hz)))
+    spectra = turned[:, None] * np.fft.rfft(accel, axis=0)
+    return replace(log, accel_mm_s2=np.fft.irfft(spectra, len(accel), axis=0))
+
+
+def test_logs_whose_phase_no_model_explains_count_as_tables() -> None:
+    plant = one_mode(42.0, 0.06)
+    test = replace(QUICK, f_end_hz=90.0)
+    settings = ReadSettings.model_validate({**QUICK_SETTINGS, "f_end_hz": 90.0})
+    log = late_by_less(quick_log(plant=plant, test=test), plant, 0.75)
+    found = one(raw_file(log), settings=settings)
+    about = found.plants.provenance
+    assert about is not None
+    assert about.magnitude_only
+    assert any("only the size of the vibrations" in text for text in found.warnings)
+    assert main_mode(found) == pytest.approx(42.0, rel=0.05)
+
+
+def test_a_fit_misses_what_the_plant_without_its_delay_misses() -> None:
+    plant, f_hz = one_mode(60.0, 0.04), np.arange(6.0, 100.0, 0.5)
+    g = frequency_response(plant, f_hz)
+    seen = np.abs(g) * np.exp(0.7j * np.angle(g))
+    fit = fit_modes(FrequencyResponse(f_hz, seen, 0.004 * np.abs(g), np.ones(len(g))))
+    used = fit.gain * np.abs(frequency_response(prompt(fit), f_hz))
+    missed = np.linalg.norm(used - np.abs(g)) / np.linalg.norm(g)
+    assert missed <= fit.residual
