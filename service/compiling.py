@@ -1,7 +1,7 @@
-"""Reports that kernels are being compiled, which happens once on a computer and takes minutes.
+"""Report that kernels are being compiled, which takes minutes, once per computer.
 
-Numba compiles a kernel when it is first called and keeps it on disk. Until it is there the work
-stands still, and what was measured of its pace says nothing of the time left.
+Numba compiles a kernel at its first call and caches it on disk. Meanwhile the work stands still,
+and its measured pace does not predict the remaining time.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ __all__ = ["STAGE", "compiling_reported"]
 STAGE = "compiling for this computer (once, some minutes)"
 
 _QUIET_S = 15.0
-"""How long nothing was compiled before the time left is told again."""
+"""Time without compiling after which the remaining time is reported again."""
 
 
 @contextmanager
@@ -31,8 +31,8 @@ def compiling_reported(callback: ProgressCallback) -> Iterator[ProgressCallback]
     Parameters
     ----------
     callback : callable
-        Is told of both. What it raises in the middle of a compiler is raised when the work next
-        says where it is.
+        Receives both. An exception raised during compilation is deferred to the next progress
+        report.
     """
     told = _CompileListener(callback)
     with install_listener("numba:compile", told):
@@ -50,7 +50,7 @@ class _CompileListener(Listener):
         self._compiled_s = 0.0
 
     def __call__(self, progress: Progress) -> None:
-        """Tell where the work is; time left by its pace without compiling."""
+        """Report progress; the remaining time is based on the pace without compiling."""
         if self._raised is not None:
             raise self._raised
         self._latest = progress
@@ -59,7 +59,7 @@ class _CompileListener(Listener):
         self._callback(progress)
 
     def on_start(self, event: Any) -> None:  # noqa: ARG002
-        """Tell that a kernel is being compiled; it may compile others on the way."""
+        """Report that a kernel is being compiled, which may involve others."""
         if self._depth == 0:
             self._since = time.monotonic()
         self._depth += 1
@@ -71,7 +71,7 @@ class _CompileListener(Listener):
             self._raised = error
 
     def on_end(self, event: Any) -> None:  # noqa: ARG002
-        """Count how long it took."""
+        """Count the time of a compilation."""
         self._depth -= 1
         if self._depth == 0:
             now = time.monotonic()
@@ -79,7 +79,7 @@ class _CompileListener(Listener):
             self._since = now
 
     def _left_s(self, progress: Progress) -> float | None:
-        """Return the time still needed, None while more is likely to be compiled."""
+        """Return the remaining time, None while more compilation is likely."""
         if time.monotonic() - self._since < _QUIET_S:
             return None
         worked_s = max(progress.elapsed_s - self._compiled_s, 0.0)

@@ -16,7 +16,7 @@ _TRIM_THRESHOLD, _TOP_PAD, _MMAP_THRESHOLD = -1, -2, -3
 """Parameters of glibc's mallopt (malloc.h)."""
 _KEPT_BYTES, _STEP_BYTES = 256 << 20, 16 << 20
 _NEW_OBJECTS = 50_000
-"""So many more objects than before make the search for cycles worth its time."""
+"""Number of new objects that triggers a garbage collection."""
 _ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -35,8 +35,8 @@ def prepare_environment(*, computing: bool = True) -> None:
     """
     if computing:
         _keep_freed_memory()
-        # Modules and kernels are very many objects, and all of them stay: to look through them
-        # whenever 700 have come, as Python does, only makes the start longer.
+        # Modules and kernels are many permanent objects: a collection for every 700 new ones,
+        # Python's default, would only slow the start.
         gc.set_threshold(_NEW_OBJECTS)
     for name in _ONE_THREAD:
         os.environ.setdefault(name, "1")
@@ -45,10 +45,10 @@ def prepare_environment(*, computing: bool = True) -> None:
 
 
 def _keep_freed_memory() -> None:
-    """Tell the allocator of glibc to reuse what is freed; elsewhere nothing happens.
+    """Make glibc's allocator keep freed memory; a no-op elsewhere.
 
-    Arrays of samples come and go by the megabyte. Given back to the kernel every time, and zeroed
-    by it anew, they cost a tenth of a job's time.
+    Returning large sample arrays to the kernel, which zeroes them again, costs a tenth of a job's
+    time.
     """
     if not sys.platform.startswith("linux"):
         return

@@ -1,7 +1,7 @@
-"""One service for each data directory.
+"""Ensure that only one service uses a data directory.
 
-At its start a service deletes broken uploads and takes up the jobs that were running; done beside
-another service, those would be the other one's.
+At its start a service deletes broken uploads and requeues running jobs; with another service on the
+same directory, these would be the other one's.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ _TAKEN = (errno.EAGAIN, errno.EACCES, errno.EDEADLK)
 
 @contextlib.contextmanager
 def exclusive(folder: Path) -> Iterator[None]:
-    """Keep a folder, made if need be, for the `with` block; the system lets go if we are killed.
+    """Lock a folder, made if necessary, for the `with` block; a killed process loses the lock.
 
     Raises
     ------
     OSError
-        EBUSY if somebody else keeps it. File systems without locks keep nothing.
+        EBUSY if another process holds it. File systems without locks do not protect.
     """
     private_folder(folder)
     handle = os.open(folder / "service.lock", os.O_RDWR | os.O_CREAT, 0o666)

@@ -1,8 +1,8 @@
-"""Ctrl-C and SIGTERM as an exception that neither gets lost nor breaks anything.
+"""Turn Ctrl-C and SIGTERM into an exception that is neither lost nor harmful.
 
 What a signal handler raises vanishes, or leaves half-made objects, when the signal arrives inside a
-callback from C or a compiler. The first signal is therefore only remembered, and raised when the
-work next says where it is; a second one is raised on the spot.
+callback from C or a compiler. The first signal is therefore only recorded, and raised at the next
+progress report; a second one is raised immediately.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def interruptible() -> Iterator[Callable[[], None]]:
 
 @contextmanager
 def interruptible_at_once() -> Iterator[None]:
-    """Raise `Interrupted` on the spot, for work in plain Python that mostly waits."""
+    """Raise `Interrupted` immediately, for work in plain Python that mostly waits."""
 
     def stop(number: int, _: FrameType | None) -> None:
         raise Interrupted(number)

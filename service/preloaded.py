@@ -14,4 +14,4 @@ prepare_environment()  # before numpy and numba
 import stillpath.pipeline.compensate  # noqa: E402
 import stillpath.reports  # noqa: E402, F401
 
-gc.freeze()  # so that the copies' collectors leave alone what they share
+gc.freeze()  # keeps the garbage collectors of forks from touching shared memory

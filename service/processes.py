@@ -1,7 +1,7 @@
 """Processes that compensate are forked from one that has already loaded the libraries.
 
-To load numba, scipy and our own modules takes longer than many a print does. One process loads
-them, and all others begin as its copies: they start at once, and share its memory.
+Loading numba, scipy and our own modules takes longer than processing many a print. One process
+loads them, and all others are forked from it: they start immediately and share its memory.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ OF_THE_SERVICE = (
 """Modules for the processes of a service; all of them are copies of the same one."""
 
 METHOD = "forkserver" if sys.platform == "linux" else "spawn"
-"""Windows has no fork, and on macOS libraries of the system do not bear one."""
+"""Windows has no fork, and on macOS system libraries do not survive one."""
 
 
 def loaded_context(*more: str) -> ForkServerContext | SpawnContext:
-    """Return what starts such processes; the first start loads the libraries.
+    """Return the context that starts such processes; the first start loads the libraries.
 
     On Windows and macOS each process loads them itself.
 
@@ -46,15 +46,15 @@ def loaded_context(*more: str) -> ForkServerContext | SpawnContext:
 
 
 def limit_memory(max_bytes: int) -> None:
-    """Let the system refuse this process more memory; where it cannot (macOS, Windows), do nothing.
+    """Limit the memory of this process; a no-op on macOS and Windows.
 
-    What is counted is private memory that may be written (RLIMIT_DATA): libraries and the addresses
-    that compilers keep free are none.
+    Private writable memory counts (RLIMIT_DATA), but not libraries and address space reserved by
+    compilers.
 
     Parameters
     ----------
     max_bytes : int
-        Beside what the process holds now; a limit set before no longer counts.
+        In addition to current memory; replaces an earlier limit.
     """
     if sys.platform != "linux":
         return
@@ -70,10 +70,9 @@ def limit_memory(max_bytes: int) -> None:
 
 
 def quiet_tracker() -> None:
-    """Start Python's tracker of semaphores with nothing to say; before any thread.
+    """Start Python's resource tracker without output, before any thread.
 
-    It tidies up after processes that were killed, which is all there is to do, and would write
-    about it, with tracebacks, among our logs.
+    It cleans up after killed processes, and would otherwise write tracebacks into our logs.
     """
     if sys.platform == "win32":
         return

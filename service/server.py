@@ -1,4 +1,4 @@
-"""Runs the HTTP application in this process."""
+"""Run the HTTP application in this process."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from stillpath.service.settings import Settings
 __all__ = ["serve_forever"]
 
 _SWITCH_S = 0.001
-"""How long a thread may keep the others waiting; by default 5 ms, at every turn of an upload."""
+"""Thread switch interval; the default of 5 ms would delay every step of an upload."""
 _BACKLOG = 1024
 _LONGEST_HEADERS_BYTES = 32 << 10
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.5, 5.0
 _GOODBYE_S = 5
-"""How long requests under way may take once the service was asked to end."""
+"""Time allowed to active requests when the service shuts down."""
 
 
 def serve_forever(
@@ -47,7 +47,7 @@ def serve_forever(
     port : int
         0 takes any free port; the first line on stdout names it.
     runner : Runner
-        Does the work of a job; tests put another in.
+        Does the work of a job; replaceable in tests.
 
     Raises
     ------
@@ -111,7 +111,7 @@ def _addresses(host: str, port: int) -> list[str]:
 def _database(settings: Settings) -> Iterator[None]:
     """Wait until the database answers: where several computers start, in any order.
 
-    The application opens it again; what uvicorn makes of an error there nobody can read.
+    The application opens it again, but errors there would be unreadable through uvicorn.
     """
     wait_s = _FIRST_WAIT_S
     while True:
@@ -119,7 +119,7 @@ def _database(settings: Settings) -> Iterator[None]:
             open_database(settings).dispose()
         except DatabaseAway as error:
             if database_url(settings).get_backend_name() == "sqlite":
-                raise  # a file that cannot be read does not come back by itself
+                raise  # an unreadable file does not recover by itself
             structlog.get_logger("serve").warning(
                 "waiting for the database", reason=str(error), again_in_s=wait_s
             )
@@ -132,7 +132,7 @@ def _database(settings: Settings) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _alone(settings: Settings) -> Iterator[None]:
-    """Keep the folder of data, unless the workers are elsewhere: then nothing lasting is in it."""
+    """Lock the data folder, unless workers are remote: then it has no permanent data."""
     if settings.scheduler is not None:
         private_folder(settings.data_dir)
         yield

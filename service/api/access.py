@@ -1,8 +1,8 @@
 """Access rights of routes: `Reader`, `Submitter` or `Admin` as a parameter.
 
-`Watcher` is a reader whose requests are not counted, for whoever follows a job; `Uploader` is a
-submitter who holds an upload slot until the answer; `Operator` is an admin, or
-somebody on this computer where no keys are asked for.
+`Watcher` is a reader whose requests are not rate-limited, for following a job; `Uploader` is a
+submitter who holds an upload slot until the response; `Operator` is an admin, or anyone on this
+computer if no keys are required.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ async def _shown(bearer: _Bearer, header: _Header) -> str | None:
 _Shown = Annotated[str | None, Depends(_shown)]
 
 
-# Each of these looks into the database, so that they are plain functions: run in a thread.
+# Each of these queries the database, so they are plain functions, which run in a thread.
 
 
 def _reader(request: Request, shown: _Shown) -> Caller:
@@ -69,8 +69,8 @@ def _admin(request: Request, shown: _Shown) -> Caller:
 
 def _operator(request: Request, shown: _Shown) -> Caller:
     remote = _remote(request)
-    # By name, too: a page of somebody else can make this computer's browser ask. Where keys are
-    # asked for, a proxy may be on this computer, and pass on any name.
+    # Check the name too: a foreign page can make this computer's browser send requests. Where keys
+    # are required, a proxy on this computer may pass on any name.
     here = is_loopback(remote or "") and is_loopback(request.url.hostname or "")
     if shown is None and here and not request.app.state.keys_required:
         return _local(remote)
@@ -94,7 +94,7 @@ Uploader = Annotated[Caller, Depends(_uploader)]
 
 
 def _allowed(request: Request, shown: str | None, scope: Scope, *, counted: bool = True) -> Caller:
-    """Return who is calling, or raise `Problem`: 401 for a wrong key, 403 for one too small."""
+    """Return the caller, or raise `Problem`: 401 for a wrong key, 403 for a missing scope."""
     caller = _caller(request, shown)
     if counted:
         limits: Limits = request.app.state.limits
@@ -131,10 +131,10 @@ def _caller(request: Request, shown: str | None) -> Caller:
         )
     refusal = key.refusal(time.time())
     if refusal is not None:
-        # Counted by address: an ended key must not be a way around that.
+        # Counted by address, which a revoked key must not circumvent.
         who = Caller(key.owner, frozenset(), remote=remote)
         _turn_away(request, who, f"{refusal} Ask for a new one.")
-    with suppress(DatabaseAway):  # that the hour cannot be written down turns nobody away
+    with suppress(DatabaseAway):  # failing to record the use must not refuse the request
         keys.used(key)
     return key.caller(remote)
 

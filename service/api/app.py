@@ -83,7 +83,7 @@ def create_app(
     keys_required : bool
         Whether callers must show a key (`service.security.keys.keys_needed`).
     runner : callable
-        Does the work of a job in the worker process; tests put another in.
+        Does the work of a job in the worker process; replaceable in tests.
     """
 
     @asynccontextmanager
@@ -158,7 +158,7 @@ def _include_routes(app: FastAPI) -> None:
 
 
 async def _open(app: FastAPI, settings: Settings, runner: Runner, stack: AsyncExitStack) -> None:
-    """Open and start everything; the stack ends it in the other order."""
+    """Open and start everything; the stack closes it in reverse order."""
     state = app.state
     engine = await run_in_threadpool(open_database, settings)
     stack.callback(engine.dispose)

@@ -1,4 +1,4 @@
-"""Timeouts for request bodies that stall: senders cannot hold upload slots, or others up."""
+"""Timeouts for stalled request bodies, so that senders cannot block upload slots."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ BODY_TIMEOUT = "stillpath.body_timeout"
 
 QUIET_S = 30.0
 LEAST_BYTES = 1024
-"""So many must come in that time: else a byte now and then would do to hold a slot."""
+"""Least number of bytes in that time: single bytes must not suffice to hold a slot."""
 _YIELDS_AFTER_S = 5.0
 
 
 class BodyTimeout:
-    """Waits for the body of one request.
+    """Receives the body of one request with a timeout.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ class BodyTimeout:
         self._receive = receive
         self._quiet_s = quiet_s
         self._bytes = 0
-        # For these bytes: what the service itself takes to write them down is not the sender's.
+        # Waiting for these bytes only: the service's own writing time does not count.
         self._waited_s = 0.0
         self._since = 0.0
         self._waiting: asyncio.Timeout | None = None
@@ -43,14 +43,14 @@ class BodyTimeout:
         self._whole = False
 
     async def receive(self) -> Message:
-        """Return the next message, whose sender may not take longer than it is allowed to.
+        """Return the next message within the time limit.
 
         Raises
         ------
         HTTPException
             408, if it does.
         """
-        if self._whole:  # what comes now is that the sender hangs up
+        if self._whole:  # only a disconnect can follow
             return await self._receive()
         self._since = asyncio.get_running_loop().time()
         try:
@@ -69,13 +69,13 @@ class BodyTimeout:
 
     @property
     def quiet_s(self) -> float:
-        """How long the sender has been waited for; 0 if nobody is waited for at the moment."""
+        """Time spent waiting for the sender; 0 if not waiting at the moment."""
         if self._waiting is None:
             return 0.0
         return self._waited_s + asyncio.get_running_loop().time() - self._since
 
     def yield_slot(self) -> bool:
-        """End the request if its sender has been quiet for some seconds: somebody else is there."""
+        """End the request if its sender has been quiet for some seconds, as another is waiting."""
         waiting = self._waiting
         if waiting is None or waiting.expired() or self.quiet_s < _YIELDS_AFTER_S:
             return False

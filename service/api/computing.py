@@ -1,6 +1,6 @@
-"""Runs a request as a job that computes its answer, while the caller waits for it.
+"""Run a request as a job that computes the response while the caller waits.
 
-A repeated request is answered by the same job, so a caller whose wait timed out just asks again.
+A repeated request gets the same job, so a caller whose wait timed out simply repeats it.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ __all__ = [
 ]
 
 _LONGEST_WAIT_S = 50.0
-"""What proxies wait for an answer is a minute, as a rule."""
+"""Proxies usually wait a minute for a response."""
 _LARGEST_ANSWER_BYTES = 64 << 20
 _ANSWERS = ("text/html", "application/json", "*/*")
 _WAIT = re.compile(r"(?:^|[,;\s])wait=(\d{1,6})(?:$|[,;\s])")
@@ -61,7 +61,7 @@ WAITING: dict[int | str, dict[str, Any]] = {
 
 
 class StillRunning(Exception):
-    """The answer takes longer than the caller waits; `job` goes on."""
+    """The response takes longer than the caller waits; `job` continues."""
 
     def __init__(self, job: Job) -> None:
         super().__init__(job.id)
@@ -130,7 +130,7 @@ class ComputeRequest:
 async def run_and_wait(request: Request, caller: Caller, asked: ComputeRequest) -> Job:
     """Return the job of a request when it is done.
 
-    A caller who hangs up before ends it, unless it was there before.
+    A disconnecting caller cancels it, unless the job existed before.
 
     Parameters
     ----------
@@ -205,7 +205,7 @@ def _submit(request: Request, asked: ComputeRequest, job: Job) -> Job:
 
 
 async def _wait(request: Request, job: Job, *, ends_with_caller: bool) -> None:
-    """Wait until the job is over, or for as long as the caller does."""
+    """Wait until the job has ended, or for as long as the caller waits."""
     state = request.app.state
     state.waiting[job.id] += 1
     try:
@@ -241,7 +241,7 @@ def _patience_s(request: Request) -> float:
 
 
 async def _while_there(request: Request, work: Coroutine[Any, Any, _T]) -> _T:
-    """Return what `work` returns; cancel it when the caller hangs up.
+    """Return the result of `work`; cancel it when the caller disconnects.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Answers with files of the storage: ranges, entity tags, HEAD; memory holds one chunk."""
+"""Responses with stored files: ranges, entity tags, HEAD; memory use is one chunk."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def _range(request: Request, tag: str, size: int) -> tuple[int, int] | None:
     found = _RANGE.fullmatch(asked.replace(" ", ""))
     start_text, last_text = found.groups() if found else (None, None)
     if start_text is None and last_text is None:
-        return None  # of another kind: as if it were not there
+        return None  # another unit: ignore the header
     if start_text is None:
         start, stop = max(size - int(last_text or 0), 0), size
     else:
@@ -131,7 +131,7 @@ def _range(request: Request, tag: str, size: int) -> tuple[int, int] | None:
 
 
 async def _closing(chunks: Iterator[bytes]) -> AsyncIterator[bytes]:
-    """Yield the chunks, and let go of the file also when the caller goes away."""
+    """Yield the chunks, and close the file even if the caller disconnects."""
     try:
         async for chunk in iterate_in_threadpool(chunks):
             yield chunk

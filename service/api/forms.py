@@ -1,4 +1,4 @@
-"""Forms (multipart/form-data) as they stream in: files to wherever they go, short fields kept."""
+"""Streaming parser of forms (multipart/form-data): files are passed on, short fields kept."""
 
 from __future__ import annotations
 
@@ -42,9 +42,9 @@ async def read_form(
     body : async iterable
         Its chunks.
     begin : callable
-        Is called with the name of each file that begins; returns what takes its bytes.
+        Called with the name of each file; returns a consumer of its bytes.
     drain : callable
-        Is awaited after each chunk: what was taken is to be written.
+        Awaited after each chunk, to write what was consumed.
 
     Raises
     ------

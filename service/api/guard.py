@@ -1,4 +1,4 @@
-"""Keeps foreign web pages out, and restricts in browsers what our own pages may do.
+"""Keep foreign web pages out, and restrict what our own pages may do in browsers.
 
 A browser can be made to send requests here by any page it shows. Where callers need no key, three
 checks stop that: the Host header must name this computer (against DNS rebinding), a request that
@@ -59,8 +59,8 @@ class Guard:
     allowed_hosts : sequence of str
         From `hosts_of`.
     trusts_all : bool
-        Callers need no key. Then what a proxy passes on is refused: it would lend its own place
-        on this computer to everybody.
+        Callers need no key. Forwarded requests are then refused: a proxy on this computer would
+        give everybody local access.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""One poller for all who watch jobs: one query each half second, however many there are."""
+"""A shared poller for all job watchers: one query each half second for any number of them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Snapshot:
     Attributes
     ----------
     tag : str
-        Names the content, the same in every process of the service.
+        Identifies the content, equal in every process of the service.
     message : bytes
         The server-sent event, encoded once for all who watch.
     is_final : bool
@@ -42,7 +42,7 @@ class Snapshot:
 
 @dataclass(slots=True, eq=False)
 class _Channel:
-    """What is known of one job; whoever is slow skips what was in between."""
+    """The latest state of one job; slow watchers skip intermediate states."""
 
     watchers: int = 0
     latest: Snapshot | None = None
@@ -82,11 +82,11 @@ class Hub:
 
     @property
     def watchers(self) -> int:
-        """How many watch."""
+        """Number of watchers."""
         return sum(channel.watchers for channel in self._channels.values())
 
     def nudge(self) -> None:
-        """Look at once: something has changed."""
+        """Poll immediately, because something has changed."""
         if self._channels:
             self._wanted.set()
 
@@ -106,7 +106,7 @@ class Hub:
                 self._wanted.set()
             while True:
                 changed, snapshot = channel.changed, channel.latest
-                # What is final is told again: the watcher may have missed that it was the end.
+                # Final states are repeated: the watcher may have missed the end of the stream.
                 if snapshot is not None and (snapshot.tag != seen or snapshot.is_final):
                     seen = snapshot.tag
                     yield snapshot

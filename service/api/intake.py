@@ -1,4 +1,4 @@
-"""Turns an upload into a queued job; a failure on the way leaves nothing behind."""
+"""Turn an upload into a queued job; a failure leaves nothing behind."""
 
 from __future__ import annotations
 
@@ -45,11 +45,11 @@ from stillpath.version import __version__
 __all__ = ["Intake", "Taken"]
 
 _STORED_AT_ONCE = 12
-"""Uploads that are put into the storage in parallel: that may take minutes, and the threads
-are for all requests."""
+"""Uploads that are stored in parallel: this may take minutes, and threads are shared by all
+requests."""
 
 _ASKED_AT_ONCE = 8
-"""Printers that are asked before an upload."""
+"""Printers that are queried in parallel before uploads."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,8 +65,7 @@ class Taken:
 class Intake:
     """Takes uploads in.
 
-    First the file is stored for good, then the job is made known: whoever is told of a job can
-    rely on its file.
+    The file is stored durably before the job is published, so every visible job has its file.
 
     Parameters
     ----------
@@ -146,7 +145,7 @@ class Intake:
         Problem
             408, 413, 422, 429 or 507; nothing of the upload is left then.
         """
-        # A printer may take its time: threads are for all requests.
+        # A printer may respond slowly, and threads are shared by all requests.
         limiter = None if wanted.printer is None else self._printers_asked
         job_id = uuid.uuid4().hex
         with self._incoming(job_id) as incoming:
@@ -181,7 +180,7 @@ class Intake:
     ) -> PinnedMachine:
         """Refuse what can be refused before the body, and write the machine beside its place.
 
-        Whatever is done now, nobody waits for who has sent the body.
+        Doing this first shortens the wait after the body was sent.
         """
         self._check_targets(wanted)
         pinned = self._pinned(wanted)
@@ -282,7 +281,7 @@ class Intake:
         idempotency: tuple[str, str] | None = None,
         audit_row: Mapping[str, Any] | None = None,
     ) -> Job:
-        """Store files, then make their job known; return it, or the one that stands for it."""
+        """Store files, then publish their job; return it, or the equivalent existing one."""
         added: Job | None = None
         try:
             self._storage.put_all(files)
@@ -307,8 +306,8 @@ class Intake:
     def _undo(self, job: Job) -> None:
         """Delete what was stored for a job that was refused, or that another one stands for.
 
-        What cannot be deleted now goes with the sweep. A database that broke off may have taken the
-        job all the same: then its files stay.
+        The sweep deletes what cannot be deleted now. If the database failed it may have stored the
+        job nevertheless: then its files stay.
         """
         with suppress(DatabaseAway, StorageError):
             if self._store.get(job.id) is None:
@@ -341,7 +340,7 @@ class Intake:
         return job
 
     def _is_known(self, caller: Caller, key: str | None) -> bool:
-        """Return whether the request may be one that has its job already, which needs no room."""
+        """Return whether the request may already have its job, which needs no space."""
         return key is not None and self._store.submitted(caller.owner, key) is not None
 
     def _check_room(self, caller: Caller) -> None:
@@ -370,7 +369,7 @@ class Intake:
 
     @contextmanager
     def _incoming(self, job_id: str) -> Iterator[Path]:
-        """Give a file for an upload on its way; gone afterwards, however the block ends.
+        """Yield a file for a current upload, deleted afterwards in any case.
 
         So is what lies beside it with the suffix ``.machine``.
         """
@@ -401,7 +400,7 @@ def _with_fields(wanted: JobQuery, upload: Upload) -> JobQuery:
 
 
 def _dedupe_key(wanted: JobQuery, upload: Upload, pinned: PinnedMachine) -> str:
-    """Return what jobs have in common that must have the same result."""
+    """Return a key that is equal for jobs with the same result."""
     return _digest(
         upload.sha256,
         upload.name,  # stands in the report
@@ -413,7 +412,7 @@ def _dedupe_key(wanted: JobQuery, upload: Upload, pinned: PinnedMachine) -> str:
 
 
 def _fingerprint(wanted: JobQuery, upload: Upload) -> str:
-    """Return what makes two requests the same."""
+    """Return a digest that is equal for identical requests."""
     return _digest(upload.sha256, upload.name, wanted.model_dump(exclude={"name"}))
 
 

@@ -1,9 +1,9 @@
-"""One tar file with database, results and machines, taken while the service works.
+"""Back up database, results and machines to one tar file while the service is running.
 
 The database comes first, by SQLite's own online backup; then the files that its rows name, which
-never change once a row names them; then everything else. A job that was deleted meanwhile is taken
-out of the copy, so that no row is without its files. The manifest closes the archive: a file that
-is broken off has none.
+never change once a row names them; then everything else. A job that was deleted meanwhile is
+removed from the copy, so that no row is without its files. The manifest comes last: a truncated
+archive has none.
 """
 
 from __future__ import annotations
@@ -131,7 +131,7 @@ def restore(source: Path, data_dir: Path) -> Manifest:
 
 
 class _Archive:
-    """A tar file that remembers what was put into it."""
+    """A tar file with a manifest of its contents."""
 
     def __init__(self, tar: tarfile.TarFile) -> None:
         self._tar = tar
@@ -158,7 +158,7 @@ class _Archive:
 
 
 class _Hashing(io.RawIOBase):
-    """A file that is hashed on its way."""
+    """A file that is hashed while it is read."""
 
     def __init__(self, file: IO[bytes]) -> None:
         self._file = file
@@ -268,7 +268,7 @@ def _unpack(source: Path, folder: Path) -> Manifest:
 
 
 def _hold_back(database: Path) -> None:
-    """Let no printer start by itself now, perhaps for the second time."""
+    """Prevent automatic starts of printers, which may have happened already."""
     if not database.exists():
         return
     why = "held back: it was due when the backup was made that was restored since"

@@ -1,1 +1,1 @@
-"""The database: the service's memory, and the migrations of its schema."""
+"""The service's database and the migrations of its schema."""

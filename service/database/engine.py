@@ -1,6 +1,6 @@
-"""Opens the database, migrates its schema, and reports plainly when it is unavailable.
+"""Open the database, migrate its schema, and report clearly if it is unavailable.
 
-``writing`` and ``reading`` are the two ways to it: one transaction for each `with` block.
+``writing`` and ``reading`` are the two kinds of access: one transaction per `with` block.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ _BUSY_TIMEOUT_MS = 30_000
 _AGAIN_S = 0.02
 _WRITER = threading.Lock()
 _WRITE_QUEUE: deque[_PendingWrite] = deque()
-"""Of those who wait for their turn in `write_together`."""
-# Taken by whoever changes the schema; a number that nobody else in the database uses.
+"""Pending writes of `write_together`."""
+# Advisory lock for schema changes; a number not used otherwise in the database.
 _MIGRATION_LOCK = 0x57111_0000
 _ON_POSTGRESQL: dict[str, Any] = {
     # A server that vanished is noticed before a worker counts as lost.
@@ -69,7 +69,7 @@ class StoreError(RuntimeError):
 
 
 class DatabaseAway(StoreError):
-    """The database does not answer, or not in time; trying again later may help."""
+    """The database does not respond, or not in time; a retry may help."""
 
 
 def database_url(settings: Settings) -> URL:
@@ -158,7 +158,7 @@ def migrate(engine: Engine) -> None:
         if not inspect(connection).get_table_names():
             _make_schema(connection)
             return
-    # Only now: most starts have nothing to do, and this takes its time.
+    # Imported late: it is slow, and most starts have nothing to migrate.
     from alembic import command
     from alembic.config import Config
     from alembic.script import ScriptDirectory
@@ -198,7 +198,7 @@ def _lock_schema(connection: Connection) -> None:
 
 
 def _make_schema(connection: Connection) -> None:
-    """Make the tables as they are now, and say so as Alembic does: there is nothing to migrate."""
+    """Create the current tables, and stamp the version like Alembic."""
     from stillpath.service.database.tables import metadata
 
     metadata.create_all(connection)
@@ -211,7 +211,7 @@ def _make_schema(connection: Connection) -> None:
 
 @contextmanager
 def writing(engine: Engine) -> Iterator[Connection]:
-    """Give a connection for one transaction, which is undone if the block raises.
+    """Yield a connection for one transaction, which is rolled back if the block raises.
 
     Raises
     ------
@@ -224,9 +224,9 @@ def writing(engine: Engine) -> Iterator[Connection]:
 def write_together(engine: Engine, work: Callable[[Connection], _T]) -> _T:
     """Return what `work` returns, done in a transaction that others may share (group commit).
 
-    SQLite lets one write after the other, and each waits for the disk. So whoever comes first does
-    what all the others in line want as well, each undone by itself if it raises, and the disk is
-    waited for once. On PostgreSQL everyone has a transaction of his own.
+    SQLite serialises writes, and each waits for the disk. So the first thread also executes the
+    pending work of all others, each rolled back separately if it raises, and waits for the disk
+    once. On PostgreSQL every call has its own transaction.
 
     Raises
     ------
@@ -245,7 +245,7 @@ def write_together(engine: Engine, work: Callable[[Connection], _T]) -> _T:
     except DatabaseAway:
         if _dequeue(mine):
             raise
-        mine.over.wait()  # somebody is at it: only then is known what came of it
+        mine.over.wait()  # another thread is executing it: wait for the outcome
     finally:
         _dequeue(mine)
     if mine.error is not None:
@@ -255,7 +255,7 @@ def write_together(engine: Engine, work: Callable[[Connection], _T]) -> _T:
 
 @contextmanager
 def reading(engine: Engine) -> Iterator[Connection]:
-    """Give a connection for reading; writers do not wait for it.
+    """Yield a connection for reading; writers do not wait for it.
 
     Raises
     ------
@@ -270,7 +270,7 @@ def reading(engine: Engine) -> Iterator[Connection]:
 
 def insert(connection: Connection, table: Table) -> Any:
     """Return an INSERT that knows ``on_conflict_do_nothing`` and ``on_conflict_do_update``."""
-    # One of them only: the drivers that SQLAlchemy knows for PostgreSQL take their time.
+    # Import only one of them: SQLAlchemy's PostgreSQL dialects load slowly.
     if connection.dialect.name == "postgresql":
         from sqlalchemy.dialects import postgresql
 
@@ -282,7 +282,7 @@ def insert(connection: Connection, table: Table) -> Any:
 
 @dataclass(eq=False, slots=True)
 class _PendingWrite:
-    """What a thread wants written, and what came of it."""
+    """The pending write of a thread, and its outcome."""
 
     engine: Engine
     work: Callable[[Connection], Any]
@@ -294,14 +294,14 @@ class _PendingWrite:
         try:
             with _translate_errors(self.engine), connection.begin_nested():
                 self.result = self.work(connection)
-        except Exception as error:  # its owner's, not that of whose turn it is
+        except Exception as error:  # belongs to its owner, not to the executing thread
             self.error = error
             if not _is_open(connection):
                 raise  # SQLite has undone the others' as well
 
 
 def _dequeue(write: _PendingWrite) -> bool:
-    """Take a write out of the queue; False: somebody has taken it already."""
+    """Remove a write from the queue; False if it was already taken."""
     try:
         _WRITE_QUEUE.remove(write)
     except ValueError:
@@ -316,8 +316,8 @@ def _is_open(connection: Connection) -> bool:
 
 
 def _commit_group(engine: Engine) -> None:
-    """Do what all in line want, in one transaction."""
-    # Not those that their owners withdraw at this moment.
+    """Execute all pending writes in one transaction."""
+    # Skip writes that their owners are withdrawing.
     pending = [write for write in _WRITE_QUEUE.copy() if write.engine is engine and _dequeue(write)]
     try:
         with _translate_errors(engine), engine.begin() as connection:
@@ -335,7 +335,7 @@ def _commit_group(engine: Engine) -> None:
 
 @contextmanager
 def _write_lock(engine: Engine) -> Iterator[None]:
-    """Let the writers of this process wait in line: SQLite's own waiting starves some for long."""
+    """Queue the writers of this process fairly: SQLite's own waiting starves some."""
     if engine.dialect.name != "sqlite":
         yield
         return

@@ -1,4 +1,4 @@
-"""Compares a printer with its machine document before a result is sent to it.
+"""Compare a printer with its machine document before a result is sent to it.
 
 A file is made for a machine document. Where printer.cfg says something else, times and vibration
 are not those that were computed; some of it makes a print unsafe, and then none is started. The
@@ -32,8 +32,8 @@ __all__ = ["Checker", "Finding", "PrinterCheck", "PrinterUnknown", "findings", "
 
 _WRAPPED = ("PAUSE", "RESUME", "CANCEL_PRINT")
 _OURS = "Stillpath:"
-"""How the descriptions of our macros begin (integrations/klipper)."""
-# Limits that no command raises: a file that was planned with more is late.
+"""Beginning of the descriptions of our macros (integrations/klipper)."""
+# Limits that no command can raise: a file planned with higher ones runs late.
 _FIXED = frozenset(
     {
         "max_z_velocity",
@@ -219,7 +219,7 @@ class Checker:
         )
 
     def lines(self, printer: Printer, machine: Machine, *, method: str) -> list[str]:
-        """Return what to warn of in a report; not being able to ask is one of it."""
+        """Return warnings for a report, also if the printer cannot be queried."""
         if printer.kind != "moonraker":
             return []
         try:
@@ -250,7 +250,7 @@ class Checker:
 
 
 def findings(machine: Machine, asked: Asked, *, method: str = DEFAULT_METHOD) -> list[Finding]:
-    """Return what speaks against printing a machine's file on a printer, unsafe things first."""
+    """Return findings against printing a machine's file on a printer, unsafe ones first."""
     firmware = machine.firmware
     if not isinstance(firmware, Klipper):
         text = (

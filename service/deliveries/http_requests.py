@@ -1,4 +1,4 @@
-"""One request to a checked address: no redirects, no proxies, and an honest end."""
+"""Send one request to a checked address, without redirects and proxies."""
 
 from __future__ import annotations
 
@@ -22,12 +22,11 @@ __all__ = ["Reply", "Unanswered", "Unreached", "get", "post"]
 _CONNECT_S = 10.0
 _LONGEST_REPLY_BYTES = 4096
 _SLOWEST = 3.0
-"""In how many times ``timeout_s`` the headers of a reply must be there, and then its body, if they
-come in drops."""
+"""Multiple of ``timeout_s`` allowed for the headers of a slow reply, and again for its body."""
 
 
 class Unreached(Exception):
-    """Nothing was sent: nobody listens there, or the name is unknown."""
+    """Nothing was sent: the connection failed, or the name is unknown."""
 
 
 class Unanswered(Exception):
@@ -205,10 +204,10 @@ def _sent(
 
 
 class _HeaderLimit:
-    """Hangs up if the headers of a reply are not there in time.
+    """Disconnects if the headers of a reply are not complete in time.
 
-    The client's own timeout begins anew with every byte. It tells what it does (httpcore's
-    extension ``trace``): what it is connected by, and when it begins to wait.
+    The client's own timeout restarts with every byte. Connection and start of waiting are taken
+    from httpcore's extension ``trace``.
     """
 
     def __init__(self, most_s: float) -> None:

@@ -6,9 +6,9 @@
        ^                    |  +---> failed
        +---- tried again ---+
 
-A claim lasts until `next_at` and is prolonged while something is sent; the number of attempts is
-its fence. So several processes may send, each delivery is sent by one at a time, and one whose
-sender was killed is taken up by another.
+A claim lasts until `next_at` and is extended while sending; the number of attempts is its fencing
+token. Several processes may send, each delivery is sent by one at a time, and one whose sender was
+killed is resumed by another.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def claim(engine: Engine, *, now: float, until: float) -> tuple[Delivery, bool] 
     before = Delivery(**row)
     after = replace(before, state="sending", attempts=before.attempts + 1, next_at=until)
     if not _changed(engine, before, after):
-        return None  # another process was quicker; there will be a next time
+        return None  # another process was faster; try again next time
     return after, before.state == "sending"
 
 
@@ -132,7 +132,7 @@ def prolong(engine: Engine, claimed: Delivery, *, until: float) -> bool:
 def settle(
     engine: Engine, claimed: Delivery, state: str, *, next_at: float, error: str | None = None
 ) -> bool:
-    """Write down what became of a claimed delivery; False: it is no longer ours."""
+    """Record the outcome of a claimed delivery; False: the claim is lost."""
     text = None if error is None else error[:2000]
     return _changed(engine, claimed, replace(claimed, state=state, next_at=next_at, error=text))
 

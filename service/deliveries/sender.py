@@ -1,4 +1,4 @@
-"""Sends due deliveries: a thread that claims them, and a few that send."""
+"""Send due deliveries: one thread claims them, and a few send."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _AT_ONCE = 4
 _STOP_S = 5.0
 _GROWTH, _MOST_STEPS = 3.0, 20
 _LONGEST_WAIT_S = 6 * 3600.0
-# Asking again would be answered in the same way.
+# Status codes after which a retry is useless.
 _IN_VAIN = frozenset((400, 401, 404, 405, 410, 413, 414, 415, 422))
 
 
@@ -50,7 +50,7 @@ class SendingTimes:
         Before the second attempt; each further one waits three times as long.
     attempts : int
     claim_s : float
-        A sender that has not been heard of for so long counts as dead.
+        Time without a sign of life after which a sender counts as dead.
     poll_s : float
         How often the table is looked at.
     start_within_s : float
@@ -119,7 +119,7 @@ class Sender:
         # What is being sent, and until when it is claimed; touched by the main thread only.
         self._sending: dict[threading.Thread, tuple[Delivery, float]] = {}
         self._seen_at = math.inf
-        """What the clock said last: it may have been set back while no service ran."""
+        """Last clock reading; the clock may have been set back while no service ran."""
 
     def start(self) -> None:
         """Begin to send."""
@@ -127,9 +127,9 @@ class Sender:
         self._main.start()
 
     def stop(self) -> None:
-        """Send nothing more; wait a moment for what is on its way.
+        """Stop sending; wait briefly for deliveries in progress.
 
-        What takes longer is left to the next start, as if the process had been killed.
+        Longer ones are left to the next start, as if the process had been killed.
         """
         self._stopping.set()
         self._wake.set()
@@ -159,7 +159,7 @@ class Sender:
                 if not away:
                     self._log.warning("no deliveries for now", reason=str(error))
                 away, claimed = True, False
-            except Exception:  # a thread that ended would send nothing more, and say nothing
+            except Exception:  # otherwise the thread would end silently and send nothing more
                 self._log.exception("deliveries broke")
                 claimed = False
             if not claimed:
@@ -177,7 +177,7 @@ class Sender:
                 self._sending[thread] = (claimed, until)
 
     def _look_at_clock(self) -> None:
-        """Where it was set back, let nothing wait longer than it was meant to."""
+        """If the clock was set back, shorten waits accordingly."""
         now = time.time()
         if now < self._seen_at:
             times = self._times
@@ -284,9 +284,9 @@ class Sender:
         return state, error
 
     def _looked_at(self, printer: Printer, job: Job) -> tuple[list[str], list[str]]:
-        """Return what to mind of a printer, and what makes a print on it unsafe.
+        """Return findings about a printer, and those that make a print unsafe.
 
-        An OctoPrint cannot tell: what is asked for there is done.
+        OctoPrint cannot be compared: the request is carried out.
         """
         if self._checker is None or printer.kind != "moonraker":
             return [], []
@@ -313,7 +313,7 @@ class Sender:
 
 @contextlib.contextmanager
 def _once(starts: bool, job: Job) -> Iterator[None]:
-    """Where an upload starts a print, turn what nobody has foreseen into `Unanswered`."""
+    """If an upload starts a print, turn unexpected errors into `Unanswered`."""
     try:
         yield
     except (TargetRefused, Unreached, Unanswered):

@@ -1,7 +1,7 @@
-"""Addresses that the service may contact, so that nobody can send it into private networks.
+"""Check addresses that the service contacts, so that it cannot be sent into private networks.
 
-An address is checked when a job is submitted, and again when it is sent to; then the name is
-resolved once, what it stands for is checked, and exactly that is connected to.
+An address is checked when a job is submitted, and again before sending: then the name is resolved
+once, and the connection goes to exactly the address that was checked.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Unresolved(OSError):
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """An address that was read with care.
+    """A validated address.
 
     Attributes
     ----------

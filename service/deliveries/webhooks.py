@@ -25,7 +25,7 @@ class SignatureRefused(ValueError):
 
 
 def body_of(job: Job) -> bytes:
-    """Return what is told of a job that is over: the same bytes each time it is asked."""
+    """Return the body of the notification about an ended job: always the same bytes."""
     here = f"/v1/jobs/{job.id}"
     told: dict[str, Any] = {
         "event": f"job.{job.state.value}",

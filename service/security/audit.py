@@ -85,7 +85,7 @@ class AuditLog:
     def row(
         self, caller: Caller, action: str, subject: str | None, **details: Any
     ) -> dict[str, Any]:
-        """Return a row, for who writes it in the transaction of what was done."""
+        """Return a row to be written in the transaction of the action."""
         return {
             "at": time.time(),
             "owner": caller.owner,
@@ -99,7 +99,7 @@ class AuditLog:
     def note(self, caller: Caller, action: str, subject: str | None, **details: Any) -> None:
         """Write a row, and the same into the log.
 
-        What was done is done, so that a database that does not answer is logged, not raised.
+        The action has already happened, so a database failure is logged, not raised.
         """
         row = self.row(caller, action, subject, **details)
         try:
@@ -110,9 +110,9 @@ class AuditLog:
             tell(row)
 
     def denied(self, caller: Caller, route: str, why: str) -> None:
-        """Write that somebody was turned away; of one address and reason once a minute.
+        """Record a refused request, at most once a minute per address and reason.
 
-        Without that limit anybody could fill the disk with rows.
+        Without that limit anyone could fill the disk.
         """
         what = (caller.remote, caller.key_id, why)
         now = time.time()

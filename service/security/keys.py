@@ -1,4 +1,4 @@
-"""API keys: random, kept as digests, with scopes, an expiry and an end."""
+"""API keys: random, stored as digests, with scopes, expiry and revocation."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ OWNER_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._@-]{0,63}$"
 _FORM = re.compile(rf"{KEY_PREFIX}[A-Za-z0-9_-]{{32,128}}")
 _FIRST = "first"
 _FILE = "first-key"
-# Of a key's last use no more is kept than this, so that reading does not become writing.
+# Resolution of a key's last use, so that not every read causes a write.
 _USE_SECONDS = 60.0
 
 
 class UnsafeBinding(ValueError):
-    """The service would answer other computers without asking for a key."""
+    """The service would serve other computers without requiring a key."""
 
 
 class KeyRefused(ValueError):
@@ -51,7 +51,7 @@ class KeyRefused(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Key:
-    """What is known of a key; the key itself is not.
+    """The stored data of a key, without the key itself.
 
     Attributes
     ----------
@@ -76,7 +76,7 @@ class Key:
     used_at: float | None = None
 
     def refusal(self, now: float) -> str | None:
-        """Return why the key no longer opens anything, or None."""
+        """Return why the key is no longer valid, or None."""
         if self.revoked_at is not None:
             return f"The key {self.id} was revoked."
         if self.expires_at is not None and self.expires_at <= now:
@@ -91,8 +91,8 @@ class Key:
 class KeyStore:
     """The keys in the database.
 
-    A key has 192 random bits, so that a plain SHA-256 of it needs neither salt nor stretching, and
-    looking the digest up tells nobody how much of a guess was right.
+    A key has 192 random bits, so its SHA-256 needs neither salt nor stretching, and looking up the
+    digest leaks no partial matches.
 
     Parameters
     ----------
@@ -158,7 +158,7 @@ class KeyStore:
         return secret
 
     def find(self, secret: str) -> Key | None:
-        """Return the key that `secret` is, whether it still opens anything or not."""
+        """Return the key of a secret, whether still valid or not."""
         if _FORM.fullmatch(secret) is None:
             return None
         query = select(keys).where(keys.c.sha256 == _digest(secret))
@@ -181,7 +181,7 @@ class KeyStore:
             return [_key(row) for row in connection.execute(query).mappings()]
 
     def revoke(self, key_id: str) -> Key | None:
-        """End a key at once and for good; return it, or None if there is none of that id."""
+        """Revoke a key immediately and permanently; return it, or None if the id is unknown."""
         if not key_id.isalnum():
             return None
         with writing(self._engine) as connection:

@@ -1,4 +1,4 @@
-"""Keeps keys and secrets out of the logs, whoever wrote them into a message."""
+"""Mask keys and secrets in log messages."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ __all__ = ["Room", "Stat", "Storage", "StorageError"]
 
 
 class StorageError(OSError):
-    """The storage does not answer, or refuses; trying again later may help."""
+    """The storage does not respond, or refuses; a retry may help."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +34,7 @@ class Stat:
 
 @dataclass(frozen=True, slots=True)
 class Room:
-    """How much the disk of a storage holds.
+    """Free and total space of a storage's disk.
 
     Attributes
     ----------
@@ -66,7 +66,7 @@ class Storage(Protocol):
         """
 
     def local(self, key: str) -> AbstractContextManager[Path]:
-        """Give a local file with the content of `key`, to be read only, for a `with` block.
+        """Yield a read-only local file with the content of `key`, for a `with` block.
 
         Raises
         ------
@@ -97,7 +97,7 @@ class Storage(Protocol):
         """Delete the files, if any, whose key begins with `prefix`, which ends with ``/``."""
 
     def room(self) -> Room | None:
-        """Return how much room its disk has; None if it has none that could be looked at."""
+        """Return the space of its disk; None if unknown."""
 
     def check(self) -> None:
         """Raise `StorageError` unless a file could be written now."""

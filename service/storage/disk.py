@@ -15,7 +15,7 @@ from stillpath.service.permissions import private_folder
 __all__ = ["DISK_FULL", "Disk", "NoRoom"]
 
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
-"""Numbers of errors that say that a disk takes no more."""
+"""Error numbers of a full disk."""
 
 _MIB = 1 << 20
 _BALLAST = "disk-reserve"
@@ -34,9 +34,9 @@ class NoRoom(OSError):
 class Disk:
     """The disk of the data directory.
 
-    Of the reserve, uploads use nothing; jobs are begun while half of it is free, and go back to the
-    queue when a quarter is left. What the database needs to delete is held by a file of its own,
-    which makes room when there is none.
+    Uploads may not use the reserve; jobs start while half of it is free, and go back to the queue
+    when a quarter is left. A placeholder file holds the space that the database needs for deleting,
+    and is removed when the disk is full.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ class Disk:
         self._reserve_bytes = reserve_bytes
 
     def free_bytes(self) -> int:
-        """Return how much may still be written."""
+        """Return the free space in bytes."""
         try:
             return shutil.disk_usage(self._folder).free
         except FileNotFoundError:
@@ -114,16 +114,16 @@ class Disk:
 
     @property
     def lets_jobs_go_on(self) -> bool:
-        """Whether a job that runs may write more."""
+        """Whether a running job may write more."""
         return not self._reserve_bytes or self.free_bytes() >= self._reserve_bytes // 4
 
     @property
     def is_full(self) -> bool:
-        """Whether a database can hardly write any more."""
+        """Whether there is hardly space left for the database."""
         return bool(self._reserve_bytes) and self.free_bytes() < _BALLAST_BYTES
 
     def hold(self) -> None:
-        """Hold some room for `give_up`, if the disk has plenty of it."""
+        """Reserve space for `give_up`, if the disk has plenty."""
         if not self._reserve_bytes or self.free_bytes() < self._reserve_bytes // 2:
             return
         size = min(_BALLAST_BYTES, self._reserve_bytes // 4)
@@ -131,7 +131,7 @@ class Disk:
         with contextlib.suppress(OSError):
             if path.exists() and path.stat().st_size == size:
                 return
-            # Written, not only promised: some file systems promise more than they have.
+            # Actually written: some file systems overcommit.
             with path.open("wb") as file:
                 for start in range(0, size, len(_CHUNK)):
                     file.write(_CHUNK[: size - start])
@@ -139,7 +139,7 @@ class Disk:
                 os.fsync(file.fileno())
 
     def give_up(self) -> None:
-        """Let go of what `hold` has put aside: something must be written on a full disk."""
+        """Release the space reserved by `hold`, for necessary writes on a full disk."""
         with contextlib.suppress(OSError):
             (self._folder / _BALLAST).unlink()
             structlog.get_logger("disk").warning("the disk is full; the reserve was given up")

@@ -1,4 +1,4 @@
-"""Creates the storage that the settings name."""
+"""Create the storage named in the settings."""
 
 from __future__ import annotations
 

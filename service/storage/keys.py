@@ -9,7 +9,7 @@ _LONGEST = 900
 
 
 def check_key(key: str) -> None:
-    """Refuse what is no key: it might be a path to elsewhere.
+    """Refuse an invalid key, which might be a path to elsewhere.
 
     Raises
     ------
@@ -24,7 +24,7 @@ def check_key(key: str) -> None:
 
 
 def check_prefix(prefix: str) -> None:
-    """Refuse what is no prefix: a key and ``/``.
+    """Refuse an invalid prefix: it must be a key and ``/``.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Removes what a killed process left behind in a folder of unfinished files."""
+"""Remove what a killed process left in a folder of unfinished files."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from pathlib import Path
 __all__ = ["delete_leftovers"]
 
 _OLD_S = 86400.0
-"""Nothing that somebody still works on is older."""
+"""Files in use are never older than this."""
 
 
 def delete_leftovers(folder: Path, pattern: str) -> None:
     """Delete the files and folders that fit `pattern` and were not touched for a day."""
     before = time.time() - _OLD_S
     for path in folder.glob(pattern):
-        with contextlib.suppress(OSError):  # somebody else is at it, too
+        with contextlib.suppress(OSError):  # another process may be deleting it too
             if path.stat().st_mtime < before:
                 if path.is_dir():
                     shutil.rmtree(path)

@@ -127,14 +127,14 @@ class LocalStorage:
         return path
 
     def _publish(self, file: Path, target: Path) -> set[Path]:
-        """Give a file its name; return the folders with new names, which are to be synced."""
+        """Rename a file to its target; return the folders to be synced."""
         changed = {target.parent}
         for attempt in range(_ATTEMPTS):
             changed |= _make_folder(target.parent)
             try:
                 file.replace(target)
             except FileNotFoundError:
-                # Somebody deletes this prefix just now, and took the folder away.
+                # The folder was deleted by a concurrent `delete` of its prefix.
                 if attempt == _ATTEMPTS - 1 or not file.exists():
                     raise
             else:
@@ -181,7 +181,7 @@ def _sync(path: Path) -> None:
 
 @contextlib.contextmanager
 def _explained() -> Iterator[None]:
-    """Turn the disk's trouble into `StorageError`; a file that is missing stays as it is."""
+    """Turn disk errors into `StorageError`, except for missing files."""
     try:
         yield
     except (FileNotFoundError, StorageError):

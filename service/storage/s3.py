@@ -58,7 +58,7 @@ class S3Storage:
     def put(self, key: str, file: Path) -> None:
         """Upload a local file and delete it here; see `Storage.put`.
 
-        A large file goes up in parts, which nobody sees until the last one has arrived.
+        A large file is uploaded in parts, which are invisible until the last one has arrived.
         """
         import obstore
 
@@ -85,7 +85,7 @@ class S3Storage:
         size = self.stat(key).size_bytes
         self._scratch.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=self._scratch, prefix=_FETCHED) as folder:
-            # Programs read the kind of a file from its name.
+            # Programs derive the type of a file from its name.
             copy = Path(folder) / key.rsplit("/", 1)[-1]
             with copy.open("wb") as file:
                 for chunk in self.read(key, 0, size):
