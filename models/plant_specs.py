@@ -6,7 +6,7 @@ DC gain 1 (an axis without slip reaches every position it is told to).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from functools import lru_cache
 from typing import Annotated, Literal, Self
 
 import numpy as np
@@ -110,7 +110,7 @@ class ModesSpec(_Plant):
         )
 
     def _as_written(self) -> Roots:
-        return _sum_of_modes([(m.f_hz, m.zeta, m.gain, 0.0) for m in self.modes])
+        return _sum_of_modes(tuple((m.f_hz, m.zeta, m.gain, 0.0) for m in self.modes))
 
 
 class RelativeMode(Document):
@@ -166,7 +166,7 @@ class RelativeModesSpec(_Plant):
         )
 
     def _as_written(self) -> Roots:
-        return _sum_of_modes([(m.f_hz, m.zeta, m.share, 1.0 - m.grounded) for m in self.modes])
+        return _sum_of_modes(tuple((m.f_hz, m.zeta, m.share, 1.0 - m.grounded) for m in self.modes))
 
 
 class PolePair(Document):
@@ -388,12 +388,14 @@ def _prompt(plant: PlantSpec) -> PlantSpec:
     return plant.without_delay() if isinstance(plant, RelativeModesSpec) else plant
 
 
-def _sum_of_modes(modes: Sequence[tuple[float, float, float, float]]) -> Roots:
+# A machine's document is read again and again, with the same dozens of members.
+@lru_cache(4096)
+def _sum_of_modes(modes: tuple[tuple[float, float, float, float], ...]) -> Roots:
     """Return the roots of a sum of gain (1 + relative 2 zeta s/w) / (1 + 2 zeta s/w + s^2/w^2).
 
     Parameters
     ----------
-    modes : sequence of (f_hz, zeta, gain, relative)
+    modes : tuple of (f_hz, zeta, gain, relative)
     """
     # In units of the mean frequency the polynomials stay well scaled.
     unit = 2 * np.pi * float(np.exp(np.mean([np.log(f_hz) for f_hz, *_ in modes])))
@@ -414,7 +416,9 @@ def _sum_of_modes(modes: Sequence[tuple[float, float, float, float]]) -> Roots:
     numerator = np.trim_zeros(np.where(np.abs(numerator) < tiny, 0.0, numerator), "f")
     zeros = np.roots(numerator) * unit if len(numerator) else np.zeros(0)
     poles = np.concatenate([_pair(f_hz, zeta) for f_hz, zeta, _, _ in modes])
-    return Roots(_complex(zeros), _complex(poles), sum(gain for _, _, gain, _ in modes), None)
+    roots = Roots(_complex(zeros), _complex(poles), sum(gain for _, _, gain, _ in modes), None)
+    roots.zeros.flags.writeable = roots.poles.flags.writeable = False  # many share them
+    return roots
 
 
 def _pair(f_hz: float, zeta: float) -> NDArray[np.complex128]:

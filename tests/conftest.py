@@ -57,8 +57,15 @@ def shared_dir() -> Path:
 
 @pytest.fixture(scope="session")
 def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of what is designed once per machine; the names of its files say for which."""
-    return tmp_path_factory.mktemp("cache")
+    """Folder of what is designed once per machine; the names of its files say for which.
+
+    All processes of a test run share it, and all runs that STILLPATH_TEST_CACHE is told.
+    """
+    own = tmp_path_factory.getbasetemp()
+    run = own.parent if "PYTEST_XDIST_WORKER" in os.environ else own
+    folder = Path(os.environ.get("STILLPATH_TEST_CACHE", run / "cache"))
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

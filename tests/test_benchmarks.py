@@ -36,8 +36,8 @@ GEAR = str(ROOT / "examples" / "cura_ender3_gear24.gcode")
             "--jobs",
             "1",
         ],
-        # Every real table is a test of its own.
-        ["identification.py", "--file", GEAR, "--machines", "ender3", "--shared", "none"],
+        # Simulated logs and spectra, and every real table, are tests of their own.
+        ["identification.py", "--file", GEAR, "--machines", "ender3", "--only", "prints"],
     ],
     ids=lambda command: command[0],
 )

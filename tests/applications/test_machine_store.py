@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
 import multiprocessing
@@ -15,7 +14,6 @@ import time
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Literal
 
 import pytest
 
@@ -35,6 +33,7 @@ from stillpath.models.store import builtin_machines, load_machine
 from stillpath.service.database.documents import DocumentTable
 from stillpath.service.database.engine import open_database
 from stillpath.service.settings import Settings
+from tests.applications.store_writers import confirm_many, delete_and_restore, write_many
 from tests.service.machines import make_confirmation, make_machine, with_accel
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -262,19 +261,6 @@ def test_a_full_disk_leaves_the_old_state(
 # Several writers
 
 
-def write_many(root: Path, writer: int, count: int) -> None:
-    store = MachineStore(root)
-    for k in range(count):
-        machine = with_accel(make_machine(), 1000.0 + 1000.0 * writer + k)
-        store.add_revision("mine", machine, author=f"writer-{writer}")
-
-
-def confirm_many(root: Path, axis: Literal["x", "y"], count: int) -> None:
-    store = MachineStore(root)
-    for k in range(count):
-        store.confirm("mine", {axis: make_confirmation(1.0 + k)}, author=axis)
-
-
 def run_together(*tasks: tuple) -> None:
     context = multiprocessing.get_context("spawn")
     processes = [context.Process(target=target, args=args) for target, *args in tasks]
@@ -308,15 +294,6 @@ def test_two_ring_tests_at_once_do_not_undo_each_other(store: MachineStore, tmp_
     assert last.machine.confirmations == dict.fromkeys("xy", make_confirmation(15.0))
 
 
-def delete_and_restore(root: Path, count: int) -> None:
-    store = MachineStore(root)
-    for k in range(count):
-        with contextlib.suppress(UnknownMachine, Conflict):
-            store.delete("mine")
-            if k % 2:
-                store.restore("mine")
-
-
 @pytest.mark.slow
 def test_writers_beside_somebody_who_deletes(store: MachineStore, tmp_path: Path):
     root = tmp_path / "machines"
@@ -330,8 +307,8 @@ def test_a_killed_writer_leaves_a_readable_store(store: MachineStore, tmp_path: 
     root = tmp_path / "machines"
     code = (
         "import sys; from pathlib import Path; "
-        "from tests.applications import test_machine_store as t; "
-        "print('go', flush=True); t.write_many(Path(sys.argv[1]), int(sys.argv[2]), 900)"
+        "from tests.applications.store_writers import write_many; "
+        "print('go', flush=True); write_many(Path(sys.argv[1]), int(sys.argv[2]), 900)"
     )
     chance = random.Random(4)
     for round_ in range(8):

@@ -33,9 +33,9 @@ def machine() -> Machine:
 
 
 @pytest.fixture(scope="module")
-def ring(machine: Machine, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def ring(machine: Machine, cache: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("ring")
-    write_ring_test(machine, folder / "ring.gcode", cache_dir=folder)
+    write_ring_test(machine, folder / "ring.gcode", cache_dir=cache)
     return folder / "ring.gcode"
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import cache
 from pathlib import Path
 
 from stillpath.models.machine import Machine
@@ -15,6 +16,7 @@ _SECTIONS = Path(__file__).parents[2] / "examples" / "firmware"
 KINDS = ("klipper", "marlin", "prusa", "bambu", "reprapfirmware")
 
 
+@cache
 def machine_of(kind: str, base: str = "ender3") -> Machine:
     """Return a machine whose firmware is of that kind or Marlin's variant, without its guards."""
     document = load_machine(base).model_dump(mode="json")

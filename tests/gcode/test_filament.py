@@ -7,6 +7,7 @@ firmware.
 from __future__ import annotations
 
 import math
+import tempfile
 from itertools import product
 from pathlib import Path
 
@@ -108,13 +109,14 @@ def test_retractions_far_from_zero_do_not_drift(decimals: int, cache: Path) -> N
     assert after == pytest.approx(before, abs=5e-5)
 
 
-def check(text: str, kind: str, folder: Path) -> bytes:
+def check(text: str, kind: str, cache: Path) -> bytes:
     """Every line finds the filament, place and modes of the original."""
     data, machine = tagged(text.encode()), machine_of(kind)
-    source, target = folder / "in.gcode", folder / "out.gcode"
-    source.write_bytes(data)
-    compensate_file(source, target, machine, Options(), cache_dir=folder)
-    written = target.read_bytes()
+    with tempfile.TemporaryDirectory() as folder:
+        source, target = Path(folder, "in.gcode"), Path(folder, "out.gcode")
+        source.write_bytes(data)
+        compensate_file(source, target, machine, Options(), cache_dir=cache)
+        written = target.read_bytes()
     assert differences(data, written, machine) == []
     return written
 

@@ -13,7 +13,7 @@ __all__ = ["BODY", "TAKES_S", "breaking_server"]
 
 BODY = b"G1 X10 Y10\n" * 1_000_000
 """More than fits into the buffers of a connection."""
-TAKES_S = 2.0
+TAKES_S = 0.8
 """How long the upload comes before it breaks off."""
 
 

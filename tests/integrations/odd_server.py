@@ -70,7 +70,9 @@ if __name__ == "__main__":
     from stillpath.service import server
     from stillpath.service.api import create_app
     from stillpath.service.settings import Settings
-    from tests.service.runners import pretend
+    from tests.service.runners import load_little, pretend
+
+    load_little()
 
     def application(settings: Settings, **more):
         return odd(create_app(settings, **more))

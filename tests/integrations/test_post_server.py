@@ -118,7 +118,7 @@ def test_a_server_that_dies_at_work(part: Path, tmp_path: Path):
     data.mkdir()
     with server(PRETEND, data) as (client, process):
         there = Running(client, data)
-        posting = start(*there.arguments, "--timeout", "5", part, home=tmp_path)
+        posting = start(*there.arguments, "--timeout", "3", part, home=tmp_path)
         there.running_job()
         process.kill()
         assert_reason(finish(posting), 1, "no answer")

@@ -15,6 +15,7 @@ if __name__ == "__main__":
     from tests.service import runners
 
     prepare_environment()
+    runners.load_little()
     reconciler._NO_ROOM_S = 3.0
     BodyTimeout.__init__.__kwdefaults__["quiet_s"] = 12.0
     runner = getattr(runners, sys.argv[2] if len(sys.argv) > 2 else "pretend")

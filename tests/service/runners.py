@@ -6,6 +6,7 @@ the result says that it was compensated, as real ones do.
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import time
 from collections.abc import Callable
@@ -14,8 +15,9 @@ from typing import Any
 from stillpath.gcode.errors import GcodeError
 from stillpath.pipeline.progress import Progress
 from stillpath.service.jobs.task import Task
+from stillpath.service.processes import METHOD
 
-__all__ = ["light", "pretend"]
+__all__ = ["light", "load_little", "pretend"]
 
 SUMMARY: dict[str, Any] = {
     "original_s": 10.0,
@@ -26,6 +28,20 @@ SUMMARY: dict[str, Any] = {
     "put_back": 0,
     "warnings": 0,
 }
+
+
+def load_little() -> None:
+    """Let the workers of this process load what the runners here need, and no pipeline."""
+    from stillpath.service.jobs import cluster
+
+    def loaded_context(*_: str) -> Any:
+        context: Any = multiprocessing.get_context(METHOD)
+        if METHOD == "forkserver":
+            dask = ["distributed", "stillpath.service.jobs.worker"]
+            context.set_forkserver_preload(["tests.service.pretended", *dask])
+        return context
+
+    cluster.loaded_context = loaded_context  # type: ignore[assignment]
 
 
 def pretend(task: Task, progress: Callable[[Progress], None]) -> dict[str, Any]:

@@ -21,12 +21,15 @@ if __name__ == "__main__":
     from stillpath.service.api import designs, live
     from stillpath.service.server import serve_forever
     from stillpath.service.settings import Settings
-    from tests.service.runners import light
+    from tests.service.runners import light, load_little
 
+    load_little()
     machine = load_machine("ender3")
     with tempfile.TemporaryDirectory() as folder:
         export = write_export(machine, Path(folder) / "stillpath.json")
-    design = design_report(machine, "x").model_dump(mode="json")
+    # Less of it than a user is shown: its form is the same.
+    less = {"errors_percent": (0.0,), "shapers": ("zv",)}
+    design = design_report(machine, "x", **less).model_dump(mode="json")
     with ExitStack() as stack:
         for route, answer in ((designs, design), (live, export)):
             for name, returned in (("run_and_wait", None), ("read_result", answer)):

@@ -15,6 +15,7 @@ if __name__ == "__main__":
     from tests.service import runners
 
     prepare_environment()
+    runners.load_little()
     configure_logging()
     settings = Settings()
     engine = open_database(settings)

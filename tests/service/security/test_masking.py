@@ -11,7 +11,7 @@ from pathlib import Path
 
 import httpx2
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stillpath.service.security.masking import mask, mask_secrets
@@ -39,6 +39,7 @@ SECRETS = st.from_regex(r"[A-Za-z0-9_-]{32,60}", fullmatch=True)
         "cannot reach http://{}@host:80/",
     ],
 )
+@settings(max_examples=25)
 @given(secret=SECRETS)
 def test_a_secret_in_a_text_is_masked(text: str, secret: str):
     shown = "sp_" + secret if text == "key {}" else secret
