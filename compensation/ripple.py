@@ -237,9 +237,9 @@ def _check(machine: Machine) -> None:
             left = table.residual_share(loose_mm)
             if left >= 1.0:
                 raise DesignError(
-                    f"axis {axis}: homing repeats within {loose_mm:g} mm, where a table leaves "
-                    f"{left:.0%} of the ripple (limit 100 %): it would do harm; home more exactly "
-                    "(endstop phase) or leave out +ripple"
+                    f"axis {axis}: homing repeats only within {loose_mm:g} mm, so a table would "
+                    f"leave {left:.0%} of the ripple (limit 100 %): it would do harm; home more "
+                    "exactly (endstop phase) or leave out +ripple"
                 )
 
 

@@ -180,7 +180,7 @@ def detect(head: bytes, tail: bytes = b"") -> Detection:
     ranked = sorted(DIALECTS, key=lambda name: -weights[name])
     best, second = ranked[0], ranked[1]
     if weights[best] == 0.0:
-        return Detection("marlin", 0.0, ("nothing in the file tells its firmware",))
+        return Detection("marlin", 0.0, ("nothing in the file says which firmware it is for",))
     lead = (weights[best] - weights[second]) / weights[best]
     certainty = lead * min(1.0, weights[best] / _SURE)
     family = {best, "marlin"} if best in ("prusa", "bambu") else {best}

@@ -117,7 +117,7 @@ class BandContent:
                         f"Axis {axis}: {beyond:.1f} um rms of the planned motion lie above "
                         f"{trust_hz:.3g} Hz, where its model cannot be trusted "
                         "(trust_below_hz): the phase was not measured. A raw accelerometer log "
-                        "would tell it."
+                        "would show it."
                     )
         return found
 

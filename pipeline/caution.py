@@ -200,11 +200,10 @@ def prediction_note(machine: Machine, choice: Choice) -> str:
         what = about.kind if about else "plants"
         measured.append(f"{len(plants.weighted_members())} ({axis.upper()}: {what}{day})")
     return (
-        f"Figures are predictions of the plants in the middle of {' and '.join(measured)} that "
-        "explain the measurement. On a test motion, delays of the axes aside, the contour error of "
-        "all of them is at most "
-        f"{choice.worst_to_none:.2f} of what it is without compensation, and {choice.mean:.2f} of "
-        f"the shaper's ({choice.worst:.2f} on the worst of them)."
+        f"Figures are predicted with the central plants of {' and '.join(measured)} that "
+        "explain the measurement. On a test motion, delays between the axes aside, no plant "
+        f"has more than {choice.worst_to_none:.2f} of its contour error without compensation, and "
+        f"on average {choice.mean:.2f} of the shaper's ({choice.worst:.2f} for the worst plant)."
     )
 
 

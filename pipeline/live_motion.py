@@ -44,8 +44,8 @@ class LiveMotion:
         """
         if shaping != OFF:
             raise DesignError(
-                f"the file sets the firmware's shaper ({shaping.label}), and the compensation "
-                "inside Klipper stands aside for it: take that line out of the file"
+                f"the file sets the firmware's shaper ({shaping.label}), which "
+                "disables the compensation inside Klipper: remove that line from the file"
             )
         if len(samples):
             self._held.append((samples, point))

@@ -76,7 +76,7 @@ def keep_file(source: Path, target: Path) -> None:
     ends = source.suffix.lower(), target.suffix.lower()
     if ends[0] != ends[1] and any(end in _PACKED for end in ends):
         raise GcodeError(
-            f"method live leaves the file as it is: {target.name} must end like {source.name}"
+            f"method live leaves the file unchanged: {target.name} must end like {source.name}"
         )
     with replacing(target) as temporary:
         shutil.copyfile(source, temporary)

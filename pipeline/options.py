@@ -51,8 +51,8 @@ _METHOD = rf"^(advise|live|({'|'.join(_PLAIN)})(\+ripple)?)$"
 def _known(method: str) -> str:
     if re.fullmatch(_METHOD, method) is None:
         raise ValueError(
-            f"there is no such method, but {', '.join(_PLAIN)}, each also with +ripple appended, "
-            "advise, and live"
+            f"unknown method; choose {', '.join(_PLAIN)}, each also with +ripple appended, "
+            "advise, or live"
         )
     return method
 
@@ -130,7 +130,7 @@ class Options(BaseModel):
         if self.method in _AS_SLICED and self.where != "all":
             raise ValueError(
                 f"method {self.method} {_AS_SLICED[self.method]}: it cannot be combined with "
-                "where, which says what is compensated; choose fbf, or leave where at all"
+                "where, which says what is compensated; choose fbf, or set where to all"
             )
         return self
 

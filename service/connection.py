@@ -203,7 +203,7 @@ class Connection:
         if size_bytes is not None and came_bytes != size_bytes:
             raise ClientError(
                 f"{path} came with {came_bytes} instead of {size_bytes} bytes from {self.server}: "
-                "something on the way answers in its stead, as a proxy with a page to log in"
+                "something in between answered instead, such as the login page of a proxy"
             )
         named = (download.tag or "").strip('"')
         if len(named) == 64 and named != download.digest.hexdigest():

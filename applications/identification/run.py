@@ -145,7 +145,7 @@ def _with_what_is_known(base: Machine, axis: Axis, found: AxisIdentification) ->
         # Its plants would override the new one.
         warnings.append(
             f"the plants of {len(before.grid.nodes)} places that the machine had for axis {axis} "
-            "are left out: they belong to the former measurement; measure there again (FILE@z=150)"
+            "were dropped: they belong to the earlier measurement; measure there again (FILE@z=150)"
         )
     schedule = AxisSchedule(mass=mass, grid=grid) if mass or grid else None
     about = found.plants.provenance

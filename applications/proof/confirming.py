@@ -387,8 +387,8 @@ def _late(axis: AxisRing, apart_ms: float) -> AxisRing:
     return axis.model_copy(
         update={
             "verdict": "not confirmed",
-            "text": f"{text}: but X and Y come {apart_ms:.1f} ms apart, which the plants do not "
-            f"say, and corners are bent. To do: {_ANEW}.",
+            "text": f"{text}: but X and Y are {apart_ms:.1f} ms apart, which the plants do not "
+            f"predict and which distorts corners. To do: {_ANEW}.",
             "confirmation": axis.confirmation.model_copy(update={"verdict": "not confirmed"}),
         }
     )

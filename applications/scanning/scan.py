@@ -145,9 +145,7 @@ def scan_file(
         drawn_mm=float(np.sum(np.hypot(*(hatches.end_mm - hatches.start_mm).T)[hatches.beam])),
         variants=tuple(_variant(name, *found) for name, found in errors.items()),
         tracks=_tracks(hatches, rows, {name: found for name, (_, found) in errors.items()}),
-        notes=tuple(
-            f"{name} means nothing to a scanner: passed over" for name in hatches.passed_over
-        ),
+        notes=tuple(f"{name} is not used by scanners: ignored" for name in hatches.passed_over),
     )
     return Scan(report, samples.t_s, command / scale, samples.track)
 

@@ -30,5 +30,5 @@ def check_unpacked(size: int, largest: int) -> None:
     if size > largest:
         raise GcodeError(
             f"the file unpacks to more than {largest >> 20} MiB, more than any print needs: it is "
-            "damaged or made to fill the disk; export plain G-code to process it all the same"
+            "damaged or made to fill the disk; export plain G-code if the file is genuine"
         )

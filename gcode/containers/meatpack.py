@@ -77,7 +77,7 @@ def pack(text: bytes) -> bytes:
     place = text.find(b"\xff")
     if place >= 0:
         raise GcodeError(
-            "the byte 255 cannot be written with MeatPack (it is no character of UTF-8); "
+            "the byte 255 cannot be written with MeatPack (it is not valid UTF-8); "
             "write plain G-code, or remove it",
             text=text[:place].rpartition(b"\n")[2].decode("latin-1"),
         )

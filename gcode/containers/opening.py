@@ -133,7 +133,7 @@ def open_text(
         raise GcodeError(f"a plate was chosen, but the file is {_NAMES[kind]} and has no plates")
     if kind is Kind.TEXT:
         if (what := foreign(path)) is not None:
-            raise GcodeError(f"the file is {what}, no G-code; give the file that the slicer wrote")
+            raise GcodeError(f"the file is {what}, not G-code; give the file that the slicer wrote")
         with path.open("rb") as text:
             yield Container(kind, path, text, None)
         return

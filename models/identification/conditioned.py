@@ -174,7 +174,7 @@ def schedulable(plants: PlantSetSpec, kind: Kind) -> tuple[PlantSetSpec, tuple[s
     if not plants.members or isinstance(plants.members, ParametricMembers):
         return plants, ()
     note = (
-        "members are spread about the plant of each place and mass: which resonance of each listed "
-        "one the schedule moves, nobody knows"
+        "members are spread about the plant of each place and mass: it is unknown which resonance "
+        "of each listed one the schedule moves"
     )
     return plants.model_copy(update={"members": parametric_members(kind)}), (note,)

@@ -46,7 +46,9 @@ class Condition:
         if weight is not None:
             kg = float(weight[1]) * (1.0 if weight[2] == "kg" else 1e-3)
             if kg == 0.0:
-                raise ModelError(f"condition {text!r}: a weight of 0 kg tells nothing")
+                raise ModelError(
+                    f"condition {text!r}: a weight of 0 kg changes nothing; leave it out"
+                )
             return cls(f"+{kg:g}kg", added_kg=kg)
         if _WEIGHT.fullmatch(f"+{text}"):
             raise ModelError(

@@ -166,8 +166,9 @@ def check_plateau(response: FrequencyResponse, excitation: Excitation) -> None:
     if gain < _NOT_MOVING:
         raise ModelError(
             f"{response.source}: between {_PLATEAU_HZ[0]:g} and {_PLATEAU_HZ[1]:g} Hz the sensor "
-            f"moved {gain:.2f} times as much as commanded: it does not sit on what moves (another "
-            "axis was measured, or only shaken along); measure at the part that the axis moves"
+            f"moved {gain:.2f} times as much as commanded: it is not mounted on what moves "
+            "(another axis was measured, or only shaken along); measure at the part that the "
+            "axis moves"
         )
     stated = excitation.accel_per_hz_mm_s
     raise ModelError(

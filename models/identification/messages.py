@@ -76,13 +76,13 @@ def body_notes(friction_mm: float, frame: Frame | None) -> list[str]:
     if friction_mm:
         notes.append(
             f"dry friction holds the axis {1e3 * friction_mm:.1f} um behind its command: the "
-            "response is freed of it, and commands make up for it"
+            "response does not contain it, and commands make up for it"
         )
     if frame is not None:
         notes.append(
-            f"the frame shakes on its feet at {frame.f_hz:.1f} Hz (what moves is "
-            f"{frame.mass_ratio:.0%} of its mass): the sensor feels it, the nozzle over the bed "
-            "does not, so the response is freed of it (frame_firm leaves it in)"
+            f"the frame shakes on its feet at {frame.f_hz:.1f} Hz (the moving "
+            f"parts are {frame.mass_ratio:.0%} of its mass): the sensor feels it, but the nozzle "
+            "does not move against the bed, so it was removed (frame_firm keeps it)"
         )
     return notes
 
@@ -163,7 +163,7 @@ def level_warnings(responses: Sequence[FrequencyResponse], fit: Fit) -> list[str
     seen = f"{names}: by the fit the sensor moved {fit.gain:.2g} times as much as commanded"
     if not _LEVELS[0] < fit.gain < _LEVELS[1]:
         raise ModelError(
-            f"{seen}: it does not sit on what moves, or accel_per_hz or its scale is wrong; "
+            f"{seen}: it is not mounted on what moves, or accel_per_hz or its scale is wrong; "
             "measure at the part that the axis moves"
         )
     return [f"{seen}; check accel_per_hz in printer.cfg and the sensor's scale"]

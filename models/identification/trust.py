@@ -63,7 +63,7 @@ def check_informative(
     if not low <= main.f_hz <= high:
         raise ModelError(
             f"{names}: the mode that rings most would be at {main.f_hz:.1f} Hz, outside the "
-            f"measured {low:.1f} to {high:.1f} Hz: nobody saw it. "
+            f"measured {low:.1f} to {high:.1f} Hz, so it was not measured. "
             + "".join(f"And: {warning}. " for warning in warnings)
             + _MEASURE
         )

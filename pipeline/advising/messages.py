@@ -51,13 +51,13 @@ def stored_settings(lines: Sequence[int], *, shaper: str | None) -> list[str]:
     """
     if not lines:
         return []
-    what = "; no shaper is advised, for the printer's is not known (firmware.shaper in the machine)"
+    what = "; no shaper is advised, as the printer's is not known (firmware.shaper in the machine)"
     if shaper is not None:
         what = f" and the shaper ({shaper})" if shaper else ""
     said = (
-        f"Line {lines[0]} stores for good what is in force. Before it the printer gets back the "
-        f"acceleration that the file or the machine's document says{what}: see that they are the "
-        "printer's, or take the line out."
+        f"Line {lines[0]} stores the current settings for good. Before it the printer gets back "
+        f"the acceleration that the file or the machine's document says{what}: check that they are "
+        "the printer's, or remove the line."
     )
     return [said]
 
@@ -103,4 +103,4 @@ def kept_beyond(features: Sequence[AdvisedFeature]) -> list[str]:
     ]
     if not names:
         return []
-    return [f"Beyond its bound, and no slower than the file has it: {', '.join(names)}."]
+    return [f"Above its bound, but not slowed below what the file asks for: {', '.join(names)}."]

@@ -411,8 +411,7 @@ class LastCheck:
         original.go_up_to(number)
         if original.text.line != number:
             raise LastCheckError(
-                f"a stream ends before line {number} of the original, of which this was written "
-                "already",
+                f"a stream ends before line {number} of the original, which was already written",
                 original.text.line,
                 self._written.line,
             )

@@ -37,8 +37,8 @@ class BudgetMeasurement(Measurement):
     """
 
     note = (
-        "Curves along the print, spectra and layers show the motion without compensation, and that "
-        "with the best shaper, at the new speeds; all other figures of these at the file's own."
+        "Curves along the print, spectra and layers show the uncompensated motion, and that with "
+        "the best shaper, at the new speeds; all other figures of the two are at the file's own."
     )
 
     def __init__(

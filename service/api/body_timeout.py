@@ -86,14 +86,11 @@ class BodyTimeout:
     def _too_quiet(self) -> HTTPException:
         if self._has_yielded:
             why = (
-                f"For {_YIELDS_AFTER_S:g} s or longer less than {LEAST_BYTES} bytes of this upload "
-                "came, and its slot was given to another one. "
+                f"Fewer than {LEAST_BYTES} bytes of this upload came within {_YIELDS_AFTER_S:g} s, "
+                "and its slot was given to another one. "
             )
         else:
-            why = (
-                f"Within {self._quiet_s:g} s less than {LEAST_BYTES} bytes of the body came, the "
-                "least that is waited for. "
-            )
+            why = f"Fewer than {LEAST_BYTES} bytes of the body came within {self._quiet_s:g} s. "
         return HTTPException(
             408, f"{why}Send it again over a better connection.", headers={"Connection": "close"}
         )

@@ -170,8 +170,9 @@ def _wanted(request: Request, name: str) -> JobQuery:
         raise Problem(
             422,
             "Printer not usable",
-            f"What is set for {name!r:.80} does not do, {place}: {complaint(first, repeat=False)}. "
-            "Change it in the printers' file (STILLPATH_PRINTERS).",
+            f"The settings of {name!r:.80} are not valid, {place}: "
+            f"{complaint(first, repeat=False)}. Change them in the printers' "
+            "file (STILLPATH_PRINTERS).",
         ) from None
 
 

@@ -130,9 +130,7 @@ def install(app: FastAPI) -> None:
         structlog.get_logger("api").error(
             "request broke", method=request.method, path=request.url.path, exc_info=error
         )
-        return problem_response(
-            problem(500, "Internal error", "The service broke; its log holds the details.")
-        )
+        return problem_response(problem(500, "Internal error", "The service failed; see its log."))
 
 
 def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:

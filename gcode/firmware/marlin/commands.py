@@ -62,7 +62,7 @@ def axis_limits(fields: str) -> Handler:
         for letter, value in given.items():
             scaled = value * float(state.f[at.F_UNIT_MM])
             if scaled <= 0.0:
-                state.warn(f"{command.name} {letter}{value:g} is not above 0 and is passed over")
+                state.warn(f"{command.name} {letter}{value:g} is not above 0 and is ignored")
                 continue
             values[fields.format(axis=letter.lower())] = scaled
         return state.set_limits(command, values)
@@ -76,7 +76,7 @@ def accelerations(state: MachineState, command: Command) -> int:
     values: dict[str, float] = {}
     for letter, value in state.numbers(command, "SPRT").items():
         if value <= 0.0:
-            state.warn(f"M204 {letter}{value:g} is not above 0 and is passed over")
+            state.warn(f"M204 {letter}{value:g} is not above 0 and is ignored")
         elif letter == "S":
             values[_M204["P"]] = values[_M204["T"]] = value * unit
         else:
@@ -92,9 +92,9 @@ def corners_and_least_speeds(state: MachineState, command: Command) -> int:
     classic = isinstance(firmware, Marlin) and firmware.junction == "classic_jerk"
     for letter, value in state.numbers(command, "BSTXYZE" if classic else "BSTJ").items():
         if letter == "J" and not 0.01 <= value <= 0.3:
-            state.warn(f"M205 J{value:g} is not between 0.01 and 0.3, and is passed over")
+            state.warn(f"M205 J{value:g} is not between 0.01 and 0.3, and is ignored")
         elif value < 0.0:
-            state.warn(f"M205 {letter}{value:g} is below 0 and is passed over")
+            state.warn(f"M205 {letter}{value:g} is below 0 and is ignored")
         else:
             values[_M205[letter]] = float(int(value)) if letter == "B" else value * unit
     return state.set_limits(command, values)
@@ -111,7 +111,7 @@ def linear_advance(state: MachineState, command: Command) -> int:
     if k is None or _other_tool(state, given):
         return state.event(EventKind.HARMLESS)
     if not 0.0 <= k <= 10.0:
-        state.warn(f"M900 K{k:g} is not between 0 and 10, and is passed over")
+        state.warn(f"M900 K{k:g} is not between 0 and 10, and is ignored")
         return state.event(EventKind.HARMLESS)
     if k == state.limit("linear_advance_k_s"):
         return state.event(EventKind.HARMLESS)

@@ -130,7 +130,7 @@ STEPS: dict[str, Word] = {
     ),
     **words("M501 M502", commands.reset_limits),
     "M808": commands.unheeded(
-        EventKind.UNKNOWN, "a part of the file repeats; it is read as if it came once"
+        EventKind.UNKNOWN, "a part of the file repeats; it is read as if it were there once"
     ),
     "M92": commands.unheeded(EventKind.HARMLESS, "steps per mm are taken from the machine"),
     "M593": EventKind.SHAPER,

@@ -44,7 +44,7 @@ PRUSA: dict[str, Word] = {
         "M9140 M9150",
         commands.unheeded(
             EventKind.UNKNOWN,
-            "stealth mode has limits of its own; those of the machine are taken as ever",
+            "stealth mode has its own limits; those of the machine are used all the same",
         ),
     ),
 }

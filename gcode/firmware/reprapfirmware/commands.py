@@ -271,7 +271,7 @@ def pop_state(state: MachineState, _command: Command) -> int:
     """M121: the modes, the units and F of the matching M120."""
     depth = int(state.factors.get("pushed", 0.0)) - 1
     if depth < 0:
-        state.warn("M121 without M120 is passed over")
+        state.warn("M121 without M120 is ignored")
         return state.event(EventKind.HARMLESS)
     saved = state.saved[f"M120 {depth}"]
     state.factors["pushed"] = float(depth)

@@ -29,7 +29,7 @@ export function responsePlots(responses, machine, signal) {
 /** Where the model may be far off although it fits. @param {any} provenance */
 function trust(provenance) {
   if (!provenance?.trust_below_hz) return null;
-  const why = provenance.kind === "spectrum" ? "the phase was not measured. A raw accelerometer log would tell it." : "its phase is not certain there.";
+  const why = provenance.kind === "spectrum" ? "the phase was not measured. A raw accelerometer log would show it." : "its phase is not certain there.";
   return h("p.hint", null, `Do not trust it above ${number(provenance.trust_below_hz)} Hz: ${why}`);
 }
 

@@ -167,7 +167,7 @@ def test_a_wrong_level_names_the_level_of_the_log(true_level: float) -> None:
 
 def test_a_sensor_that_is_only_shaken_along_has_its_own_message() -> None:
     log = measured(MODES, SHORT, sensor=Sensor(gain=0.08))
-    with pytest.raises(ModelError, match="does not sit on what moves"):
+    with pytest.raises(ModelError, match="is not mounted on what moves"):
         estimate_response(log, SHORT)
 
 
