@@ -68,7 +68,7 @@ machines_drawn = st.builds(
 
 
 @given(machines_drawn, machines_drawn)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_diff_is_empty_for_equal_machines_only(one: Machine, other: Machine):
     assert diff(one, one) == ()
     assert (diff(one, other) == ()) == (one == other)
@@ -76,7 +76,7 @@ def test_diff_is_empty_for_equal_machines_only(one: Machine, other: Machine):
 
 
 @given(st.lists(machines_drawn, min_size=2, max_size=4), st.data())
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_rollback_then_diff_is_empty(
     tmp_path_factory: pytest.TempPathFactory, machines: list[Machine], data: st.DataObject
 ):

@@ -72,7 +72,7 @@ def test_decoupled_form() -> None:
 
 
 @given(st.integers(1, 30), st.integers(0, 2**31))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_error_is_orthogonal_to_what_can_be_done(n: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     g = ToeplitzOperator(rng.normal(size=30) * 0.7 ** np.arange(30))

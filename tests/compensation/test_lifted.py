@@ -91,7 +91,7 @@ def test_products_are_those_of_the_matrix(name: str) -> None:
 
 
 @given(st.integers(1, 40), st.integers(0, 39), st.integers(0, 2**31))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_adjoint_identity(m: int, ahead: int, seed: int) -> None:
     rng = RNG(seed)
     g = ToeplitzOperator(rng.normal(size=m), rng.normal(size=min(ahead, m - 1)))
@@ -153,7 +153,7 @@ def test_kernels_are_their_source() -> None:
 
 
 @given(st.integers(1, 8), st.integers(1, 30), st.integers(0, 2**31))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_set_by_displacement_is_the_dense_sum(members: int, m: int, seed: int) -> None:
     rng = RNG(seed)
     markov, weights = rng.normal(size=(members, m)), rng.uniform(0.1, 1, size=members)

@@ -27,7 +27,7 @@ def moments(taps: np.ndarray) -> tuple[float, float]:
     return float(taps.sum()), float(late @ taps)
 
 
-@settings(deadline=None, max_examples=15)
+@settings(max_examples=15)
 @given(st.floats(20.0, 90.0), st.floats(0.03, 0.2), st.sampled_from([70.0, 150.0, 270.0]))
 def test_slow_motion_is_not_moved(f_hz: float, zeta: float, corner_hz: float) -> None:
     taps = design_taps([mode(f_hz, zeta)], np.ones(1), corner_hz)

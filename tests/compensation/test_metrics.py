@@ -47,7 +47,7 @@ def test_error_depends_on_n_alone(name: str, n: int) -> None:
 
 
 @given(st.integers(1, 25), st.integers(0, 2**31))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_no_basis_needs_less_effort_than_323(n: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     g = ToeplitzOperator(rng.normal(size=25) * 0.6 ** np.arange(25))

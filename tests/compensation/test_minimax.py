@@ -25,7 +25,7 @@ def responses(f_hz: list[float], zeta: float = 0.05) -> np.ndarray:
     return np.array([p.frequency_response(F_HZ) for p in plants])
 
 
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(st.lists(st.floats(20.0, 90.0), min_size=1, max_size=6), st.floats(0.02, 0.2))
 def test_saddle_point(f_hz: list[float], zeta: float) -> None:
     """Members with weight are the worst and equal; no other member is worse (duality)."""
@@ -39,7 +39,7 @@ def test_saddle_point(f_hz: list[float], zeta: float) -> None:
         assert errors.max() <= dual * 1.01
 
 
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 @given(st.integers(0, 2**31))
 def test_no_weights_have_a_smaller_worst_member(seed: int) -> None:
     g, s = responses([36.0, 40.5, 45.0, 49.5, 54.0]), path_spectrum(F_HZ)

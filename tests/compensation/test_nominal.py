@@ -30,7 +30,7 @@ def equal(markov: np.ndarray) -> LiftedSet:
 
 
 @given(st.integers(1, 6), st.integers(2, 20), st.integers(0, 2**31))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_spread_is_the_sum(count: int, m: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     markov, weights = rng.normal(size=(count, m)), rng.uniform(0.1, 1, count)

@@ -120,7 +120,7 @@ def test_default_bandwidth() -> None:
     )
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(
     st.integers(0, 2**31),
     st.sampled_from(DISTRIBUTIONS),

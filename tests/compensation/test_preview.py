@@ -222,7 +222,7 @@ def test_figures_of_the_method() -> None:
     assert rms[100] <= 0.5
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(
     seed=st.integers(0, 2**31),
     update=st.integers(1, 6),
@@ -254,7 +254,7 @@ def test_twin_of_advance_window(count: int) -> None:
     np.testing.assert_allclose(z, [*states, committed[-1], committed[-2]], atol=1e-12)
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(st.integers(0, 2**31), st.integers(1, 6), st.integers(0, 50))
 def test_twin_of_advance_state(seed: int, order: int, samples: int) -> None:
     rng = np.random.default_rng(seed)
@@ -292,7 +292,7 @@ def test_wrong_sets() -> None:
         lifted_window([good], [1.0], 60, 61)
 
 
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 @given(st.integers(0, 2**31), st.integers(2, 8))
 def test_components_are_the_members(seed: int, count: int) -> None:
     """The components' weighted errors add up to the members', up to what no command changes."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from stillpath.compensation._shaper_kernels import add_delayed
@@ -76,7 +76,6 @@ def test_exact_shapers_cancel_their_mode(name: str, zeta: float) -> None:
     assert weights.sum() == pytest.approx(1.0)
 
 
-@settings(deadline=None)  # the first call compiles
 @given(
     st.sampled_from(SHAPERS),
     st.floats(20, 200),
@@ -137,7 +136,6 @@ def test_compensator_stands_still_in_rests() -> None:
     np.testing.assert_allclose(u[:, 50:115], free[:, 50:115], atol=1e-12)
 
 
-@settings(deadline=None)
 @given(
     n=st.integers(1, 12),
     shifts=st.lists(st.integers(-20, 20), max_size=4),

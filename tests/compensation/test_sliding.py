@@ -142,7 +142,7 @@ def nearest(path: np.ndarray, point: np.ndarray, k: int, reach: int) -> np.ndarr
     return best
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(
     st.integers(0, 2**31), st.floats(0, 1), st.floats(0, 1), st.integers(1, 6), st.floats(0.5, 1.9)
 )

@@ -95,7 +95,7 @@ def test_arcs_shift_no_axis_against_the_other(speed_mm_s: float) -> None:
     assert abs(lead.mean()) < 1e-4 + radius * max(own)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     modes=st.lists(
         st.tuples(

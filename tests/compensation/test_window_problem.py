@@ -156,7 +156,7 @@ def test_impossible_bounds_are_left_to_the_caller(design: PreviewDesign) -> None
     np.testing.assert_array_equal(found, free)
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(st.integers(0, 2**31), st.integers(1, 3), st.integers(1, 3 * BLOCK))
 def test_twin_of_weighted_gram(seed: int, components: int, window: int) -> None:
     """Against the definition, with weights that change anywhere, to and from nothing."""
@@ -169,7 +169,7 @@ def test_twin_of_weighted_gram(seed: int, components: int, window: int) -> None:
     np.testing.assert_allclose(out, expected, atol=1e-10)
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(st.integers(0, 2**31), st.integers(1, 12))
 def test_twin_of_factorise(seed: int, n: int) -> None:
     rng = np.random.default_rng(seed)

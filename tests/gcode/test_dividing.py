@@ -29,7 +29,7 @@ def longest_piece(kind: str) -> Piece:
 
 @pytest.mark.parametrize("kind", KINDS)
 @given(data=st.data())
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_the_parts_are_the_piece(kind: str, data: st.DataObject) -> None:
     piece, machine = longest_piece(kind), ender3_with(kind)
     n = len(sections(piece))

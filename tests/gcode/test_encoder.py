@@ -132,7 +132,7 @@ def test_plain_path_survives(machine: Machine) -> None:
 # Twins
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(seed=st.integers(0, 2**31), level=st.booleans())
 def test_twin_of_lay_out(seed: int, level: bool) -> None:
     """Small steps on a coarse grid, so that many segments round to no motion."""
@@ -205,7 +205,7 @@ def laid_out(
     return out
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(seed=st.integers(0, 2**31), n=st.integers(1, 40))
 def test_written_numbers_read_back(machine: Machine, seed: int, n: int) -> None:
     """The text of the moves, read by the interpreter, has their positions, filament and F."""

@@ -82,7 +82,7 @@ def test_filament(kind: str, name: str, cache: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@settings(deadline=None, max_examples=15)
+@settings(max_examples=15)
 @given(steps=st.lists(STEPS, min_size=10, max_size=60))
 def test_filament_of_any_print(kind: str, cache: Path, steps: list[tuple]) -> None:
     text = Print(kind).text(steps)

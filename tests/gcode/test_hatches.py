@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from stillpath.gcode.errors import GcodeError
@@ -81,7 +81,6 @@ def test_samples_keep_speed_and_settle() -> None:
     st.lists(st.tuples(st.integers(-50, 50), st.integers(-50, 50), st.booleans()), min_size=1),
     st.sampled_from([1e-4, 2.5e-5]),
 )
-@settings(deadline=None)
 def test_every_sample_lies_on_its_track(points: list[tuple[int, int, bool]], dt: float) -> None:
     lines = [f"{'M3' if on else 'M5'}\nG1 X{x / 10} Y{y / 10}" for x, y, on in points]
     found = read_hatches("F6000\n" + "\n".join(lines) + "\nM3\nG1 X99 Y99")

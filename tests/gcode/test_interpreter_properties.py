@@ -15,7 +15,6 @@ from stillpath.models.machine import Machine
 from tests.gcode.cutting import blocks_of
 
 relaxed = settings(
-    deadline=None,
     max_examples=60,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
 )

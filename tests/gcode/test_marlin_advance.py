@@ -115,7 +115,7 @@ def test_the_lead_is_built_up_kept_and_given_back() -> None:
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0.5, 50.0))
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_the_lead_is_never_faster_than_the_extruder_may(seed: int, fastest: float) -> None:
     rng = np.random.default_rng(seed)
     n = int(rng.integers(1, 80))

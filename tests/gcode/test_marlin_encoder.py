@@ -93,7 +93,7 @@ def test_no_turn_is_bent_into_a_move_that_is_swallowed() -> None:
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([80.0, 160.0]))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_rates_reach_the_ends_in_time(seed: int, per_mm: float) -> None:
     rng = np.random.default_rng(seed)
     n = 200

@@ -64,7 +64,7 @@ def plan(firmware: Marlin, parts: list[Moves], *, corexy: bool = False) -> Phase
 
 
 @given(MACHINES, streams(), st.booleans())
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_what_every_plan_keeps(firmware: Marlin, moves: Moves, corexy: bool) -> None:
     phases = plan(firmware, [moves], corexy=corexy)
     assert phases.move_index.tolist() == list(range(len(moves)))
@@ -91,7 +91,7 @@ def test_what_every_plan_keeps(firmware: Marlin, moves: Moves, corexy: bool) -> 
 
 
 @given(MACHINES, streams(), st.lists(st.integers(0, 60), max_size=5))
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 def test_cutting_the_stream_changes_nothing(firmware: Marlin, moves: Moves, cuts: Any) -> None:
     bounds = sorted({0, len(moves), *(min(c, len(moves)) for c in cuts)})
     parts = [rows_of(moves, slice(a, b)) for a, b in pairwise(bounds)]
@@ -101,7 +101,7 @@ def test_cutting_the_stream_changes_nothing(firmware: Marlin, moves: Moves, cuts
 
 
 @given(streams())
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_ideal_trapezoids_join_without_steps_of_speed(moves: Moves) -> None:
     firmware = Marlin(variant="prusa", min_steps_per_segment=1)
     phases = plan(firmware, [moves])
@@ -111,7 +111,7 @@ def test_ideal_trapezoids_join_without_steps_of_speed(moves: Moves) -> None:
 
 
 @given(streams())
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_higher_limits_are_not_slower(moves: Moves) -> None:
     firmware = Marlin(variant="prusa", slowdown=False)
     own = initial_limits(firmware)
@@ -150,7 +150,7 @@ def ring_of_blocks(
 
 
 @given(st.integers(1, 60), st.integers(0, 2**32 - 1), st.sampled_from([4, 8, 16]))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_the_queue_settles_like_a_ring_of_blocks(n: int, seed: int, size: int) -> None:
     rng = np.random.default_rng(seed)
     queue = np.zeros((n, Q_SIZE))
@@ -220,7 +220,7 @@ def interrupts(
     st.booleans(),
     st.sampled_from([0.0, 30_000.0]),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_step_times_are_those_of_the_interrupts(
     steps: int,
     decades: float,

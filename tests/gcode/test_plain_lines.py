@@ -16,7 +16,6 @@ from stillpath.models.firmware import Klipper, Marlin, RepRapFirmware
 from stillpath.models.machine import Machine
 
 relaxed = settings(
-    deadline=None,
     max_examples=150,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
 )

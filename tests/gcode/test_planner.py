@@ -235,7 +235,7 @@ thick = FIRMWARE.extruder.model_copy(update={"max_extrude_cross_section_mm2": 1e
 TOLERANT = FIRMWARE.model_copy(update={"extruder": thick})
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(streams())
 def test_twin(moves: Moves) -> None:
     plan = plan_moves(moves, LIMITS, TOLERANT)
@@ -245,7 +245,7 @@ def test_twin(moves: Moves) -> None:
     np.testing.assert_allclose(got, expected, rtol=1e-9, atol=1e-3)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(streams(), st.lists(st.integers(0, 40), max_size=8))
 def test_streaming_is_one_shot(moves: Moves, cuts: list[int]) -> None:
     whole = plan_moves(moves, LIMITS, TOLERANT)
@@ -258,7 +258,7 @@ def test_streaming_is_one_shot(moves: Moves, cuts: list[int]) -> None:
     assert planner.time_s == pytest.approx(duration(whole))
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(streams())
 def test_plan_is_sound(moves: Moves) -> None:
     plan = plan_moves(moves, LIMITS, TOLERANT)

@@ -270,7 +270,7 @@ def test_limits_wait_until_the_move_before_them_is_planned() -> None:
         max_size=60,
     )
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_predicted_times_are_the_planners(steps: list[tuple[float, float, float]]) -> None:
     """What the encoder predicts is the firmware's own plan; to a clock where a time is half of one.
 
@@ -352,7 +352,7 @@ def test_a_long_segment_a_little_faster_than_its_neighbours_is_in_time(excess_mm
 
 
 @given(st.lists(st.floats(1e-3, 5e-3), min_size=2, max_size=40), st.floats(1e-3, 4e-3))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_crowded_ends_are_kept_apart(lasts: list[float], least_s: float) -> None:
     end_s = np.cumsum(lasts)
     n = len(end_s)

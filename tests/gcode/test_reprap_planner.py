@@ -428,7 +428,7 @@ FIRMWARES = st.sampled_from(
 
 
 @given(steps_strategy(), POLICIES, FIRMWARES, st.sampled_from([0.0, 0.05]))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_kernels_agree_with_plain_python(
     steps: list[tuple[float, float, float, float, float]],
     policy: float,
@@ -446,7 +446,7 @@ def test_kernels_agree_with_plain_python(
 
 
 @given(steps_strategy(), POLICIES, FIRMWARES, st.sampled_from(["cartesian", "corexy"]))
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 def test_properties(
     steps: list[tuple[float, float, float, float, float]],
     policy: float,
@@ -498,7 +498,7 @@ def long_pairs(phases: Phases) -> np.ndarray:
 
 
 @given(steps_strategy(), FIRMWARES, st.sets(st.integers(0, 90), max_size=5))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_cutting_the_stream_changes_nothing(
     steps: list[tuple[float, float, float, float, float]],
     firmware: RepRapFirmware,

@@ -41,7 +41,7 @@ def plan(golden_machine: Machine) -> Phases:
     return plan_of(text, golden_machine)
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(st.lists(st.floats(-1, 6), max_size=40).map(sorted))
 def test_twin(plan: Phases, times: list[float]) -> None:
     position, row = sample_phases(plan, np.array(times))
@@ -64,7 +64,7 @@ def test_grid_as_times(plan: Phases, axes: int) -> None:
     np.testing.assert_array_equal(inside, times <= until_s[row])
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(
     st.lists(st.tuples(st.integers(0, 400), st.floats(-1, 6), st.floats(0, 6)), max_size=6),
     st.integers(0, 1000),
@@ -95,7 +95,7 @@ def test_ends_and_stand(plan: Phases) -> None:
     assert row.tolist() == [1, 1, 1]
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(st.lists(st.integers(0, 200), max_size=8), st.sampled_from([0.0005, 0.004, 0.3]))
 def test_streaming_has_no_gap(plan: Phases, cuts: list[int], dt_s: float) -> None:
     sampler = Sampler(dt_s)

@@ -79,7 +79,7 @@ def fit(command: np.ndarray, tolerance_mm: float, plant: DiscretePlant = SILENT)
     return fit_segments(line_of(command), command, tolerance_mm, ErrorFilter([plant, plant]))
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(
     seed=st.integers(0, 10**6),
     samples=st.integers(3, 600),
@@ -104,7 +104,7 @@ def test_bounds(seed: int, samples: int, tolerance_um: float, speed: float, shap
     assert np.max(np.abs(error[3])) <= module.E_TOLERANCE_MM * 1.01
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(seed=st.integers(0, 10**6), samples=st.integers(60, 400), shaped=st.booleans())
 def test_ends_grid_and_order(seed: int, samples: int, shaped: bool) -> None:
     command = curvy(seed, samples)
@@ -243,7 +243,7 @@ def answered(plant: DiscretePlant, state: np.ndarray, error: np.ndarray) -> np.n
     return y
 
 
-@settings(deadline=None, max_examples=5, derandomize=True)
+@settings(max_examples=5, derandomize=True)
 @given(seed=st.integers(0, 10**6), tolerance_um=st.sampled_from([2.0, 5.0]))
 @pytest.mark.parametrize("shaped", [False, True])
 def test_twin(shaped: bool, seed: int, tolerance_um: float) -> None:

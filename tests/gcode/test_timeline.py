@@ -53,7 +53,7 @@ def test_groups(piece: Piece) -> None:
     ]
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(rest_s=st.floats(1e-4, 0.3), lead=st.sampled_from([0.0, 0.02]), tail=st.floats(0, 0.05))
 def test_layout(piece: Piece, rest_s: float, lead: float, tail: float) -> None:
     line = timeline(piece, rest_s, lead_s=lead, tail_s=tail)
@@ -76,7 +76,7 @@ def test_layout(piece: Piece, rest_s: float, lead: float, tail: float) -> None:
     assert line.position_mm.shape[1] == round(line.end_s[-1] / DT_S) + 1
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(rest_s=st.floats(1e-4, 0.3))
 def test_x_and_y_stand_in_rests(piece: Piece, rest_s: float) -> None:
     line = timeline(piece, rest_s)

@@ -108,7 +108,7 @@ def motions(draw: st.DrawFn) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 @given(motions(), st.sampled_from([1, 2, 6, 12]), st.booleans())
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_vertices_are_whole_steps_far_enough_apart_in_time(
     motion: tuple[NDArray[np.float64], NDArray[np.float64]], least: int, corexy: bool
 ) -> None:

@@ -153,7 +153,7 @@ _OWN_MOVES = ("G1 Z5 F900", "G1 E-50 F1000", "G1 X0 Y0 F9000")
 _COMMANDS = ("PAUSE", "RESUME", "M600", "CANCEL_PRINT", "stretch", "end of stretch", "file")
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(st.lists(st.sampled_from(_COMMANDS), max_size=12))
 def test_ones_own_moves_never_run_under_raised_limits(commands: list[str]):
     """And what a pause found is in force again when the print goes on."""

@@ -75,7 +75,7 @@ def loop(a: float, b: float, delay: int, every: int, phase: int, zero: bool) -> 
     small, small, st.integers(0, 3), st.integers(1, 3), st.integers(0, 2), st.booleans(),
     st.integers(0, 2**32 - 1), st.integers(0, 40),
 )  # fmt: skip
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_kernel_is_the_definition(
     a: float, b: float, delay: int, every: int, phase: int, zero: bool, seed: int, cut: int
 ) -> None:

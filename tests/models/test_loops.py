@@ -114,7 +114,7 @@ def test_pid_on_the_error_is_python_controls() -> None:
 
 
 @given(st.floats(0.8, 1.2), st.floats(0.0, 2.0))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_variation_is_gain_and_delay(gain: float, delay: float) -> None:
     loop = load_loop("galvo-40khz").nominal()
     f = np.array([50.0, 400.0])

@@ -43,7 +43,7 @@ def lowest_hz(machine: Machine, point: OperatingPoint) -> dict[str, float]:
     return {name: float(resonances_hz(axis.nominal)[0]) for name, axis in axes.items()}
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     mass_kg=st.floats(0.0, 4.0),
     x_mm=st.floats(0.0, 220.0),

@@ -89,7 +89,7 @@ def test_hold_is_exact_for_a_ramp_between_samples() -> None:
 
 
 @given(modes)
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_sum_of_modes_is_the_sum(listed: list[tuple[float, float]]) -> None:
     spec = ModesSpec(modes=tuple(Mode(f_hz=f, zeta=z, gain=1 / len(listed)) for f, z in listed))
     s = 2j * np.pi * F_HZ
@@ -101,7 +101,7 @@ def test_sum_of_modes_is_the_sum(listed: list[tuple[float, float]]) -> None:
 
 
 @given(st.floats(0.8, 1.2), st.floats(0.5, 1.5))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_scaling_roots_is_scaling_the_document(frequency: float, damping: float) -> None:
     plain = PairsSpec(poles=PAIRS.poles, zeros=PAIRS.zeros)
     roots = plain.roots()

@@ -95,7 +95,7 @@ def printed(data: bytes, machine: Machine) -> list[tuple[str, int, Limits, Shapi
     return found
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(lines=st.lists(LINES, max_size=40), ends=st.sampled_from(["", "\n", "\r\n"]))
 def test_any_file(lines: list[str], ends: str) -> None:
     machine = klipper()
@@ -292,7 +292,7 @@ TEXTS = st.one_of(
 )
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     begun=st.sampled_from([b"", b"\xef\xbb\xbf", b"\r\n", b";FLAVOR:Marlin\r\n"]),
     parts=st.lists(st.tuples(TEXTS, ENDS), max_size=25),

@@ -15,7 +15,7 @@ _SAMPLES = 80 * BLOCK
 
 
 @given(st.lists(st.integers(0, _SAMPLES), max_size=6))
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 def test_blocks_of_any_length(cuts: list[int]) -> None:
     rng = np.random.default_rng(1)
     path = np.cumsum(np.cumsum(rng.normal(scale=1e-3, size=(2, _SAMPLES)), axis=1), axis=1)

@@ -295,7 +295,7 @@ def same(one: list[LayerTile], other: list[LayerTile]) -> bool:
     )
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(2, 60))
 def test_tiles_hold_what_was_measured(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
@@ -339,7 +339,7 @@ def test_tiles_hold_what_was_measured(seed: int, count: int) -> None:
             assert tile.max_um == pytest.approx(1e3 * error[:, own].max(axis=1))
 
 
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_twin(seed: int) -> None:
     """The compiled loop and the same lines run by Python."""

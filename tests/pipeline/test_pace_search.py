@@ -40,7 +40,7 @@ class Law:
         return Tried(errors, unfit, sum(1.0 + 1.0 / factor for factor in factors.values()))
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     own=st.lists(st.floats(0.01, 2.0), min_size=2, max_size=2),
     shaken=st.lists(st.floats(0.0, 1.0), min_size=2, max_size=2),

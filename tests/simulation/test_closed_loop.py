@@ -39,7 +39,7 @@ def test_step_is_python_controls() -> None:
 
 
 @given(st.integers(0, 3000), st.integers(1, 4), st.integers(0, 3))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_stream_is_the_whole(cut: int, every: int, age: int) -> None:
     sensor = SensorSpec(every=every, delay_samples=age, quantum=0.01)
     made = [

@@ -48,7 +48,7 @@ def wander(
     st.sampled_from([0.03, 1.0]), st.integers(1, 5), st.integers(1, 80),
     st.lists(st.integers(0, 300), max_size=4),
 )  # fmt: skip
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 def test_contour_meter_is_brute_force(
     seed: int, n: int, deviation: float, bends: float, stride: int, window: int, cuts: list[int]
 ) -> None:
@@ -85,7 +85,7 @@ def test_few_segments_are_looked_at() -> None:
 
 
 @given(st.integers(0, 1000), st.lists(st.integers(0, 400), max_size=3))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_motion_meter_adds_up(seed: int, cuts: list[int]) -> None:
     n, stride = 400, 3
     y_d, y = wander(seed, n, 0.02)
@@ -110,7 +110,7 @@ def test_motion_meter_adds_up(seed: int, cuts: list[int]) -> None:
 
 
 @given(st.integers(0, 1000), st.lists(st.integers(0, 60), max_size=3))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_groups_add_up(seed: int, cuts: list[int]) -> None:
     n = 60
     rng = np.random.default_rng(seed)

@@ -103,7 +103,7 @@ def test_the_linear_part_is_that_of_another_solver(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(seed=st.integers(0, 10_000))
 def test_every_printer_stands_where_it_is_told(kind: str, seed: int) -> None:
     """Slow motion arrives whole; guides delay it by at most d/k, and nothing else does."""

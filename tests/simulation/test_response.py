@@ -53,7 +53,7 @@ def twin(plant: DiscretePlant, u: np.ndarray) -> np.ndarray:
 @given(
     st.lists(st.floats(-300, 300), min_size=2, max_size=50), st.integers(0, 50), st.integers(0, 50)
 )
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_stream_is_the_recursion(name: str, values: list[float], cut: int, more: int) -> None:
     plant = discretise(SPECS[name], 1e-3)
     u = np.array(values)

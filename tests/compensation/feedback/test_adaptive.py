@@ -87,7 +87,7 @@ def test_in_noise_the_residual_is_the_noise() -> None:
 
 
 @given(st.floats(0.01, 0.48), st.floats(0.01, 0.48), st.floats(0.001, 100.0), st.floats(0, 6.28))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_locks_and_follows_one_jump(first: float, second: float, size: float, phase: float) -> None:
     tracker = FrequencyTracker(1, TS)
     k = np.arange(3000)

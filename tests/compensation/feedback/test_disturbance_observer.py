@@ -122,7 +122,7 @@ class TestObserver:
             design_disturbance_observer(late, 800.0)
         assert refused.value.reason == "unstable"
 
-    @settings(max_examples=25, deadline=None)
+    @settings(max_examples=25)
     @given(cutoff=st.floats(5, 1500), gain=st.floats(0.6, 1.5), delay=st.floats(0.0, 4.0))
     def test_stable_on_every_member_or_refused(
         self, cutoff: float, gain: float, delay: float

@@ -78,7 +78,7 @@ targets = st.lists(st.floats(0.03, 0.45), min_size=1, max_size=3, unique=True)
 
 
 @given(targets, st.sampled_from(SHAPES), st.sampled_from(AROUND), st.sampled_from([None, 60.0]))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_q_interpolates(
     parts: list[float], shape: Shape, around: Around, bandwidth_hz: float | None
 ) -> None:
@@ -95,7 +95,7 @@ def test_q_interpolates(
 
 
 @given(targets, st.floats(20, 400), st.sampled_from(builtin_loops()))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_what_is_returned_is_stable_on_every_member(
     parts: list[float], bandwidth_hz: float, machine: str
 ) -> None:

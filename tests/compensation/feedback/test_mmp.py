@@ -71,7 +71,7 @@ def test_section_5() -> None:
 
 
 @given(sets)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_short_form_is_the_full_system(case: tuple[list[float], int, float]) -> None:
     parts, ratio, alpha = case
     f = [p / TS for p in parts]
@@ -83,7 +83,7 @@ def test_short_form_is_the_full_system(case: tuple[list[float], int, float]) -> 
 
 
 @given(sets, st.integers(0, 2), st.integers(0, 2**32 - 1))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_predictor_is_exact_on_its_signals(
     case: tuple[list[float], int, float], late: int, seed: int
 ) -> None:
@@ -170,7 +170,7 @@ def test_table_1() -> None:
     st.lists(st.floats(0.03, 0.47), min_size=1, max_size=3, unique=True), st.integers(2, 4),
     st.floats(2.0, 60.0),
 )  # fmt: skip
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_what_is_returned_is_stable_on_every_member(
     parts: list[float], ratio: int, bandwidth_hz: float
 ) -> None:

@@ -153,7 +153,7 @@ def test_multirate_beats_the_others_also_on_plants_that_differ() -> None:
         assert left["multirate"] < left["quasi"] < baseline
 
 
-@settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=10, suppress_health_check=[HealthCheck.too_slow])
 @given(
     divisor=st.sampled_from([480.0, 600.0, 960.0, 1200.0, 1920.0, 2400.0]),
     alpha=st.floats(0.9, 0.9999),
@@ -298,7 +298,7 @@ def test_names_what_is_out_of_range(change: dict[str, object], words: str) -> No
         design_wide_band(LOOPS, 1200.0, **change)
 
 
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=25, suppress_health_check=[HealthCheck.too_slow])
 @given(
     fundamental=st.floats(300, 2500),
     alpha=st.floats(0.5, 0.9999),

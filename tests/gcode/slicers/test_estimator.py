@@ -10,7 +10,7 @@ from types import MappingProxyType
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from stillpath.gcode.slicers._estimator_kernels import queue_times, trapezoid_s
@@ -100,7 +100,6 @@ def test_other_families_have_no_estimate() -> None:
 speeds = st.floats(0.1, 300.0)
 
 
-@settings(deadline=None)
 @given(
     st.lists(
         st.tuples(st.floats(0.01, 50.0), speeds, st.floats(0, 1), st.floats(0, 1)),

@@ -161,7 +161,7 @@ def test_the_corpus(
         assert facts.number("machine_max_acceleration_x") is not None
 
 
-@settings(deadline=None, max_examples=100)
+@settings(max_examples=100)
 @given(
     st.lists(
         st.sampled_from([b"TIME", b"time", b"ime", b"tT", b"\n", b";", 59 * b"x", 61 * b" "]),

@@ -56,7 +56,7 @@ def test_start_and_direction_are_found(
     assert aligned.notes == ()
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=12)
 @given(st.floats(0.0, 1e5), st.floats(-0.4, 8.0), st.floats(0.0, 6.0), st.integers(0, 2**32 - 1))
 def test_any_start_is_found(start_s: float, lead_s: float, tail_s: float, seed: int) -> None:
     log = simulate_log(

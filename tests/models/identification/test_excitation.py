@@ -64,7 +64,7 @@ def test_frequency_rises_at_the_given_rate() -> None:
     np.testing.assert_allclose(f, expected, rtol=1e-3)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     st.floats(3.0, 12.0),
     st.floats(20.0, 60.0),

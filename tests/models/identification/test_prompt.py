@@ -53,7 +53,7 @@ def plants(draw: st.DrawFn) -> PlantSpec:
     )
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(plants())
 def test_slow_motion_is_on_time(plant: PlantSpec) -> None:
     late_s = delay_of(plant)

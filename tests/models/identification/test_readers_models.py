@@ -237,7 +237,7 @@ def test_sampling_time_may_be_told() -> None:
     assert read(continuous, sampling_s=0.002).spec.sampling_s is None
 
 
-@hypothesis_settings(max_examples=60, deadline=None)
+@hypothesis_settings(max_examples=60)
 @given(
     st.lists(st.tuples(st.floats(20, 150), st.floats(0.02, 0.3)), min_size=1, max_size=4),
     st.lists(st.tuples(st.floats(20, 150), st.floats(-0.2, 0.3)), max_size=4),
@@ -275,7 +275,6 @@ def test_state_space_in_any_scale_of_its_states(
     )
 
 
-@hypothesis_settings(deadline=None)
 @given(
     st.dictionaries(
         st.from_regex(r"[A-Za-z][A-Za-z0-9_]{0,30}", fullmatch=True),
@@ -334,7 +333,7 @@ def test_matlab_refusals() -> None:
         read_content(bomb.getvalue(), "model.mat")
 
 
-@hypothesis_settings(max_examples=30, deadline=None)
+@hypothesis_settings(max_examples=30)
 @given(
     st.lists(
         st.tuples(st.floats(10, 150), st.floats(0.02, 0.4)),

@@ -67,7 +67,7 @@ def _finite(measured: Measurement) -> bool:
     return all(a is None or bool(np.isfinite(a).all()) for a in arrays)
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=400)
 @given(st.sampled_from(sorted(VALID)), st.sampled_from(SETTINGS), st.data())
 def test_changed_bytes_are_read_or_refused(
     name: str, known: ReadSettings, data: st.DataObject
@@ -90,7 +90,7 @@ _POISON = (
 )  # fmt: skip
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(st.binary(max_size=300), st.sampled_from(["a.csv", "raw_data_x_1.csv", "m.json", "m.mat"]))
 def test_any_bytes(content: bytes, name: str) -> None:
     with pytest.raises(ModelError):

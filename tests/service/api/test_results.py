@@ -43,7 +43,7 @@ def test_a_result_is_named_by_its_digest(client: TestClient, job: str):
     assert head.headers["accept-ranges"] == "bytes"
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(first=st.integers(0, 9000), last=st.none() | st.integers(0, 9000))
 def test_ranges_are_slices(client: TestClient, job: str, first: int, last: int | None):
     given_range = f"bytes={first}-{'' if last is None else last}"

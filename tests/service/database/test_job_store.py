@@ -33,7 +33,7 @@ from tests.service.database.happenings import events
 
 # The database is one for all examples; every example takes jobs and owners of its own.
 many_examples = settings(
-    max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 
 

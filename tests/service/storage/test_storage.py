@@ -200,7 +200,6 @@ def test_both_agree_with_a_dict(storage: Storage, tmp_path: Path):
         settings=settings(
             max_examples=40 if is_local else 8,
             stateful_step_count=20 if is_local else 8,
-            deadline=None,
             suppress_health_check=list(HealthCheck),
         ),
     )
