@@ -75,7 +75,7 @@ def fit_modes(
     if not found:
         return pairs
     trials = tuple(OrderTrial(c.structure.modes, c.nrmse) for c in found)
-    modes = [replace(_as_used(data, _as_fit(data, c)), trials=trials) for c in found]
+    modes = [replace(_as_fit(data, c), trials=trials) for c in found]
     # Modes that cancel each other explain much, and nobody knows where they are.
     modes = [fit for fit in modes if main_mode_known(fit)] or modes
     # Pairs whose slow motion is late by much explain a response, but are not used as fitted.
@@ -107,8 +107,7 @@ def refit(measured: FrequencyResponse, like: Fit) -> Fit:
     ratio = data.response / structure.response(theta, data.f_hz)
     start = with_gain(data, structure, theta, low_frequency_delay(data.f_hz, ratio))
     fitted = _polished(data, start, _least_damping(data, start))
-    fit = _as_used(data, _as_fit(data, fitted))
-    return replace(fit, trials=(OrderTrial(structure.modes, fitted.nrmse),))
+    return replace(_as_fit(data, fitted), trials=(OrderTrial(structure.modes, fitted.nrmse),))
 
 
 def alternatives(measured: FrequencyResponse, fit: Fit) -> tuple[Fit, ...]:
@@ -128,9 +127,10 @@ def alternatives(measured: FrequencyResponse, fit: Fit) -> tuple[Fit, ...]:
 
 
 def _as_used(data: ResponseData, fit: Fit) -> Fit:
-    """Return the fit with the residual of the plant that is made of it, slow motion on time.
+    """Return a fit of pairs with the residual of the plant that is made of it (`prompt`).
 
-    For a delay of some milliseconds, which is the clock's, that is another plant (`prompt`).
+    Pairs may fit with a delay of many milliseconds. Without it, they are another plant. Modes
+    delay slow motion by their grounded damping at most.
     """
     turned = np.exp(-2j * np.pi * data.f_hz * (fit.delay_s + delay_of(fit.spec)))
     model = fit.gain * turned * frequency_response(prompt(fit), data.f_hz)
