@@ -274,7 +274,7 @@ def test_walls_are_slow_where_nothing_else_will_do(tmp_path: Path, cache: Path) 
     assert walls.within_bound
     # What is stored for good is the printer's own; of its shaper nobody knows.
     assert b"M493" not in written
-    said = next(x for x in result.warnings if "stores for good" in x)
+    said = next(x for x in result.warnings if "settings for good" in x)
     assert said.startswith(f"Line {data.count(bytes([10]))} ")
     assert "no shaper is advised" in said
 
