@@ -55,6 +55,7 @@ _UNSEEN_ZETA = 0.03
 _EARLIER_S, _DELAY_STEP_S = 10e-3, 0.25e-3
 _START_ZETA, _BEYOND = 0.08, 1.3
 _START_POINTS = 160
+_GROSS = 0.5
 
 
 def fit_modes(
@@ -75,7 +76,7 @@ def fit_modes(
     if not found:
         return pairs
     trials = tuple(OrderTrial(c.structure.modes, c.nrmse) for c in found)
-    modes = [replace(_as_fit(data, c), trials=trials) for c in found]
+    modes = [replace(_as_used(data, _as_fit(data, c)), trials=trials) for c in found]
     # Modes that cancel each other explain much, and nobody knows where they are.
     modes = [fit for fit in modes if main_mode_known(fit)] or modes
     # Pairs whose slow motion is late by much explain a response, but are not used as fitted.
@@ -107,7 +108,8 @@ def refit(measured: FrequencyResponse, like: Fit) -> Fit:
     ratio = data.response / structure.response(theta, data.f_hz)
     start = with_gain(data, structure, theta, low_frequency_delay(data.f_hz, ratio))
     fitted = _polished(data, start, _least_damping(data, start))
-    return replace(_as_fit(data, fitted), trials=(OrderTrial(structure.modes, fitted.nrmse),))
+    fit = _as_used(data, _as_fit(data, fitted))
+    return replace(fit, trials=(OrderTrial(structure.modes, fitted.nrmse),))
 
 
 def alternatives(measured: FrequencyResponse, fit: Fit) -> tuple[Fit, ...]:
@@ -127,14 +129,16 @@ def alternatives(measured: FrequencyResponse, fit: Fit) -> tuple[Fit, ...]:
 
 
 def _as_used(data: ResponseData, fit: Fit) -> Fit:
-    """Return a fit of pairs with the residual of the plant that is made of it (`prompt`).
+    """Return the fit with the residual of the plant that is made of it (`prompt`).
 
     Pairs may fit with a delay of many milliseconds. Without it, they are another plant. Modes
-    delay slow motion by their grounded damping at most.
+    delay slow motion by their grounded damping only, so they count as fitted unless that is gross.
     """
     turned = np.exp(-2j * np.pi * data.f_hz * (fit.delay_s + delay_of(fit.spec)))
     model = fit.gain * turned * frequency_response(prompt(fit), data.f_hz)
     missed = np.linalg.norm(model - data.response) / np.linalg.norm(data.response)
+    if isinstance(fit.spec, RelativeModesSpec) and missed <= _GROSS:
+        return fit
     return replace(fit, residual=max(fit.residual, float(missed)))
 
 
