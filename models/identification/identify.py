@@ -231,7 +231,7 @@ class _AxisWork:
         notes += by_file((r.source, n) for r in found.measured for n in r.notes)
         told, warned = parted(dict.fromkeys(notes))
         names = list(dict.fromkeys(m.source for m in used))
-        of_fit = fit_warnings(found.fit, names) if found.fit else ()
+        of_fit = fit_warnings(found.fit, names, found.warnings) if found.fit else ()
         warnings = (*of_fit, *found.warnings, *warned)
         if found.fit is not None:
             check_informative(found.fit, found.measured, names, warnings)

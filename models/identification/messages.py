@@ -118,8 +118,8 @@ def parted(told: Iterable[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     return notes, tuple(text.replace(_WARNING, "", 1) for text in warned)
 
 
-def fit_warnings(fit: Fit, sources: Sequence[str]) -> tuple[str, ...]:
-    """Return warnings about an unreliable model; refuse a useless one."""
+def fit_warnings(fit: Fit, sources: Sequence[str], warned: Sequence[str]) -> tuple[str, ...]:
+    """Return warnings about an unreliable model; refuse a useless one, with what was `warned`."""
     if fit.magnitude_only:
         limits, missed = (_POOR_DB, _USELESS_DB), f"{fit.residual:.1f} dB"
     else:
@@ -131,7 +131,9 @@ def fit_warnings(fit: Fit, sources: Sequence[str]) -> tuple[str, ...]:
     if fit.residual > limits[1]:
         raise ModelError(
             f"{', '.join(sources)}: no stable model of {fit.order} modes explains this: it misses "
-            f"{missed}. Check that file, axis and test belong together. {remedy}"
+            f"{missed}. Check that file, axis and test belong together. "
+            + "".join(f"And: {warning}. " for warning in warned)
+            + remedy
         )
     if fit.residual > limits[0]:
         text = f"the model misses {missed} of what was measured: look at the curves before it is"

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import threading
 from collections import Counter
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
+from typing import Any
 
 from fastapi import Depends, FastAPI
 from starlette.concurrency import run_in_threadpool
@@ -69,6 +71,19 @@ Errors are `application/problem+json` (RFC 9457).
 """
 
 
+class _App(FastAPI):
+    """Describes itself to one thread at a time: FastAPI shares what it computes meanwhile."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**settings)
+        self._describing = threading.Lock()
+
+    def openapi(self) -> dict[str, Any]:
+        """Return the OpenAPI document."""
+        with self._describing:
+            return super().openapi()
+
+
 def create_app(
     settings: Settings, *, keys_required: bool = False, runner: Runner = run_compensation
 ) -> FastAPI:
@@ -92,7 +107,7 @@ def create_app(
             await _open(app, settings, runner, stack)
             yield
 
-    app = FastAPI(
+    app = _App(
         title="Stillpath",
         version=__version__,
         description=_DESCRIPTION,

@@ -173,7 +173,7 @@ def test_weights_and_places(store: MachineStore, folder: Path, capsys) -> None:
     (folder / "b").mkdir()
     assert identify(*placed([quick_raw("x"), quick_raw("y")], folder / "b"), "-m", "mine") == 0
     told = " ".join(capsys.readouterr().out.split())
-    assert "warning: the plants of 2 places that the machine had for axis x are left out" in told
+    assert "warning: the plants of 2 places that the machine had for axis x were dropped" in told
     assert "that axis y moves stay: no weight was put on the bed" in told
     after = store.current("mine").machine.schedules
     assert after == {"y": schedules["y"]}

@@ -49,7 +49,7 @@ def test_options_take_every_compensator_and_nothing_else():
         "FBF",
         "fbf+ripple+ripple",
     ):
-        with pytest.raises(ValidationError, match="no such method, but fbf"):
+        with pytest.raises(ValidationError, match="unknown method; choose fbf"):
             Options(method=wrong)
 
 

@@ -223,7 +223,7 @@ class TestAxes:
 
     def test_homing_that_would_do_harm(self) -> None:
         loose = axis_ripple(homing_repeatability_mm=0.4)
-        with pytest.raises(DesignError, match=r"homing repeats within 0\.4 mm"):
+        with pytest.raises(DesignError, match=r"homing repeats only within 0\.4 mm"):
             RippleCompensator(PassThrough(), rippled(printer(), x=loose), DT)
         close = axis_ripple(homing_repeatability_mm=0.03)
         RippleCompensator(PassThrough(), rippled(printer(), x=close), DT)

@@ -87,7 +87,7 @@ def test_a_cancelled_job_ends_the_stream(client: TestClient):
 
 def test_heartbeats_are_comments(client: TestClient, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("stillpath.service.api.events._HEARTBEAT_S", 0.1)
-    where = post(client, b"nap 1").headers["location"]
+    where = post(client, b"nap 2").headers["location"]
     text = client.get(f"{where}/events").text
     assert ": still here\n\n" in text
     assert "\r" not in text

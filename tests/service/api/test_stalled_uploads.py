@@ -47,7 +47,9 @@ async def whole(body: BodyTimeout) -> int:
 def test_silence_ends_a_body() -> None:
     async def ask() -> None:
         body = BodyTimeout(Sender((0, LEAST_BYTES)).receive, quiet_s=0.1)
-        with pytest.raises(HTTPException, match=r"Within 0\.1 s less than 1024 bytes") as caught:
+        with pytest.raises(
+            HTTPException, match=r"Fewer than 1024 bytes of the body came within 0\.1 s"
+        ) as caught:
             await whole(body)
         assert caught.value.status_code == 408
 
@@ -134,7 +136,7 @@ def test_many_stalled_uploads_do_not_lock_a_good_one_out(tmp_path: Path) -> None
 
         assert finished(client, until(good, 20).headers["location"])["state"] == "done"
         answers = [answer(opened) for opened in senders]
-        assert time.monotonic() - began < 60
+        assert time.monotonic() - began < 120  # each has 20 s at most, on a busy computer more
         statuses = [text.split(" ")[1] for text in answers]
         assert set(statuses) == {"408", "429"}
         assert statuses[-1] == "408"
