@@ -50,7 +50,7 @@ def test_a_compensated_file_is_compared_with_live_printing(
     hand_in(page, tmp_path, "Compensate")
     expect(page.get_by_role("heading", name="Two ways to print it")).to_be_visible()
     expect(page.get_by_role("heading", name="Print it as a file")).to_be_visible()
-    expect(page.get_by_text("Figures are predictions of the plants in the middle")).to_be_visible()
+    expect(page.get_by_text("Figures are predicted with the central plants")).to_be_visible()
     expect(page.get_by_role("heading", name="Print it live")).to_be_visible()
     expect(page.get_by_role("link", name=re.compile("^G-code"))).to_be_visible()
     visitor.shoot(page, "two-ways")
