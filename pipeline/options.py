@@ -130,7 +130,7 @@ class Options(BaseModel):
         if self.method in _AS_SLICED and self.where != "all":
             raise ValueError(
                 f"method {self.method} {_AS_SLICED[self.method]}: it cannot be combined with "
-                "where, which says what is compensated; choose fbf, or set where to all"
+                "where, which says what is compensated; choose fbf, or use where=all"
             )
         return self
 

@@ -175,7 +175,7 @@ def test_where_is_for_what_is_compensated(method: str) -> None:
 
     with pytest.raises(ValidationError, match=rf"method {method} .*where") as refused:
         Options(method=method, where="walls")
-    assert "set where to all" in wrong_option(refused.value)
+    assert "or use where=all" in wrong_option(refused.value)
     assert Options(method="none+ripple", where="walls").where == "walls"
 
 
