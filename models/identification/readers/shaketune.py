@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
+from typing import Annotated
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, FailFast, ValidationError
 
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.readers.accelerations import read_klipper_log
@@ -27,7 +28,7 @@ _LABEL = re.compile(rf"({'|'.join(_AXES)})(?:_|$)", re.IGNORECASE)
 
 class _Recording(BaseModel):
     name: str
-    samples: list[tuple[float, float, float, float]]
+    samples: Annotated[list[tuple[float, float, float, float]], FailFast()]
 
 
 def is_shaketune(content: bytes) -> bool:
