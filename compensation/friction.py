@@ -1,7 +1,8 @@
 """Compensation of dry friction on top of a vibration compensator.
 
 With the command w + c s(w) the axes receive w (`models.friction`). The reversals of s are smoothed
-symmetrically, so that the motors can follow.
+symmetrically, so that the motors can follow: more so, or not compensated, around places where the
+vibration compensator already needs what the motors can do.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d
 
 from stillpath.compensation.base import Compensator
 from stillpath.compensation.overlay import Overlay
@@ -22,8 +24,10 @@ __all__ = ["FrictionCompensator", "against_friction"]
 Array = NDArray[np.float64]
 
 _ROUNDED_S = (4e-3, 8e-3, 16e-3)
-"""Lengths of the smoothing window; the first that keeps the machine's limits is used."""
+"""Lengths of the smoothing window: around each place, the first that keeps the machine's limits."""
 _BLEND_S = 0.01
+_PASSES = 4
+"""The way over to a gentler command may exceed the limits too; then it begins earlier."""
 
 
 def against_friction(
@@ -77,12 +81,25 @@ class FrictionCompensator(Overlay):
     ) -> Array:
         """See `compensation.base.Compensator.compensate`."""
         wanted = self._inner.compensate(y_d_mm, extruding, rests)
-        for rounded_s in _ROUNDED_S:
-            u = against_friction(wanted, self._held_mm, rests, self._dt_s, rounded_s)
-            u = self._within_travel(wanted, u)
-            if self._kept(u, wanted):
-                return u
-        return wanted
+        u = self._against(wanted, rests, _ROUNDED_S[0])
+        for rounded_s in _ROUNDED_S[1:]:
+            u = self._eased(u, self._against(wanted, rests, rounded_s), wanted)
+        u = self._eased(u, wanted, wanted)
+        left = np.any(self._beyond(u, wanted), axis=1, keepdims=True)
+        return np.where(left, wanted, u)
+
+    def _against(self, wanted: Array, rests: NDArray[np.int64], rounded_s: float) -> Array:
+        u = against_friction(wanted, self._held_mm, rests, self._dt_s, rounded_s)
+        return self._within_travel(wanted, u)
+
+    def _eased(self, u: Array, gentler: Array, wanted: Array) -> Array:
+        """Return a command that passes over to a gentler one where it exceeds the limits."""
+        for _ in range(_PASSES):
+            beyond = self._beyond(u, wanted)
+            if not beyond.any():
+                break
+            u = u + _around(beyond, self._dt_s) * (gentler - u)
+        return u
 
     def _within_travel(self, wanted: Array, u: Array) -> Array:
         for row, inner, travel in zip(u, wanted, self._travel, strict=True):
@@ -101,3 +118,10 @@ def _window(length_s: float, dt_s: float) -> Array:
 def _rounded(row: Array, window: Array) -> Array:
     half = len(window) // 2
     return np.convolve(np.pad(row, half, mode="edge"), window, mode="valid")
+
+
+def _around(beyond: NDArray[np.bool_], dt_s: float) -> Array:
+    """Return 1 around marked samples, and less further away, shape (2, n)."""
+    reach = round(_ROUNDED_S[-1] / dt_s)
+    near = maximum_filter1d(beyond.astype(float), 4 * reach + 1, axis=1)
+    return np.stack([_rounded(row, _window(2 * _ROUNDED_S[-1], dt_s)) for row in near])

@@ -56,16 +56,18 @@ class Overlay:
         """See `compensation.base.Compensator.ease`."""
         return self._inner.ease(accel_share)
 
-    def _kept(self, u: Array, wanted: Array) -> bool:
-        """Return whether a command keeps each axis' limits, or needs no more than `wanted`.
+    def _beyond(self, u: Array, wanted: Array) -> NDArray[np.bool_]:
+        """Return where a command exceeds an axis' limits and all that `wanted` needs, (2, n).
 
         The inner compensator may exceed the limits; the addition must not make that worse.
         """
+        beyond = np.zeros(u.shape, np.bool_)
         for order, limits in ((1, self._speed_mm_s), (2, self._accel_mm_s2)):
-            asked, own = (
-                np.abs(np.diff(rows, order)).max(axis=1, initial=0.0) / self._dt_s**order
-                for rows in (u, wanted)
-            )
-            if np.any(asked > np.maximum(own, limits)):
-                return False
-        return True
+            asked, own = (np.abs(np.diff(rows, order)) / self._dt_s**order for rows in (u, wanted))
+            most = np.maximum(own.max(axis=1, initial=0.0), limits)
+            beyond[:, order:] |= asked > most[:, None]
+        return beyond
+
+    def _kept(self, u: Array, wanted: Array) -> bool:
+        """Return whether a command keeps each axis' limits, or needs no more than `wanted`."""
+        return not self._beyond(u, wanted).any()

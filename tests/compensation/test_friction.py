@@ -82,3 +82,21 @@ def test_it_stays_on_the_bed() -> None:
     command = one.compensate(edge, extruding, np.zeros((0, 2), np.int64))
     assert command[0].min() >= MACHINE.travel["x"].min_mm
     assert command[1].min() >= MACHINE.travel["y"].min_mm
+
+
+def test_one_place_at_the_limit_costs_no_more_than_this_place() -> None:
+    """Motors that are at their limit in one corner compensate friction everywhere else."""
+    path, extruding = motion()
+    none = np.zeros((0, 2), np.int64)
+    inner = compensator("fbf", MACHINE.without_friction(), DT_S)
+    inner.reset(path[:, 0])
+    wanted = inner.compensate(path, extruding, none)
+    accel = np.abs(np.diff(wanted, 2, axis=1)) / DT_S**2
+    limits = MACHINE.command.model_copy(update={"accel_mm_s2": float(accel.max())})
+    one = compensator("fbf", MACHINE.model_copy(update={"command": limits}), DT_S)
+    one.reset(path[:, 0])
+    command = one.compensate(path, extruding, none)
+    assert np.abs(np.diff(command, 2, axis=1)).max() / DT_S**2 <= accel.max() * (1 + 1e-9)
+    free = against_friction(wanted, MACHINE.friction_mm, none, DT_S)
+    same = np.all(np.abs(command - free) < 1e-9, axis=0)
+    assert 0.8 < np.mean(same) < 1.0
