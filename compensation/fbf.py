@@ -11,7 +11,8 @@ For a plant set the error along the path may count less than the error across it
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import replace
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +36,7 @@ from stillpath.compensation.preview_axis import (
 )
 from stillpath.compensation.sliding import balanced_weights, slide
 from stillpath.compensation.window_problem import Bounds, Extremes
-from stillpath.models.machine import Machine
+from stillpath.models.machine import Machine, MotorLimits
 from stillpath.models.plants import DiscretePlant, PlantSet, plant_set
 from stillpath.models.schedule import OperatingPoint
 
@@ -43,6 +44,8 @@ __all__ = ["LADDER", "ROBUST", "PreviewFbf", "Rung"]
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
+_Found: TypeAlias = tuple[AxisCommand, int, frozenset[int]]
+"""Command of an axis, its rung, and the windows solved within bounds."""
 
 ROBUST = ("off", "ensemble", "minimax")
 """off: the nominal plant; ensemble: weighted least squares over the set; minimax: the same with
@@ -132,6 +135,13 @@ class PreviewFbf:
         self._limits = [machine.command.of("x"), machine.command.of("y")]
         self._accel_share = 1.0
         self._travel = [machine.travel[axis] for axis in ("x", "y")]
+        motors = machine.command.motors or MotorLimits()
+        self._motors = Bounds(
+            accel=(motors.accel_mm_s2 or np.inf) * dt_s**2,
+            speed=(motors.velocity_mm_s or np.inf) * dt_s,
+            low_mm=-np.inf,
+            high_mm=np.inf,
+        )
         self._last: list[AxisCommand] = []
         self.rungs: tuple[int, ...] = ()
         # Delays are not vibration: leading the path by them would help only if they were exact.
@@ -213,6 +223,8 @@ class PreviewFbf:
             for i, path in enumerate(y_d_mm)
         ]
         found = [self._ladder(axis, task) for axis, task in zip(self._axes, tasks, strict=True)]
+        if np.isfinite([self._motors.accel, self._motors.speed]).any():
+            found, tasks = self._within_motors(found, tasks)
         self._last = [command for command, _, _ in found]
         self.rungs = tuple(rung for _, rung, _ in found)
         if self.along < 1.0:
@@ -221,6 +233,39 @@ class PreviewFbf:
                 self._axes, self._last, tasks, chosen, extruding, self.along, self._dt_s
             )
         return np.stack([command.position_mm for command in self._last])
+
+    def _within_motors(
+        self, found: list[_Found], tasks: list[AxisTask]
+    ) -> tuple[list[_Found], list[AxisTask]]:
+        """Solve windows again in which X and Y together ask too much of a motor (CoreXY).
+
+        Each axis may use half of what the motor bears there. Where that does not help, the commands
+        are returned as they were.
+        """
+        outside = self._over_limits(found, tasks)
+        if not outside:
+            return found, tasks
+        accel, speed = 0.5 * self._motors.accel, 0.5 * self._motors.speed
+        halves = [replace(task, bounds=task.bounds.at_most(accel, speed)) for task in tasks]
+        tried = found
+        for _ in range(_BOUNDED_ROUNDS):
+            tried = [
+                (axis.command(rung, task, careful | outside), rung, careful | outside)
+                for axis, task, (_, rung, careful) in zip(self._axes, halves, tried, strict=True)
+            ]
+            outside = self._over_limits(tried, tasks)
+            if not outside:
+                return tried, halves
+            if all(outside <= careful for _, _, careful in tried):
+                break
+        return found, tasks
+
+    def _over_limits(self, found: list[_Found], tasks: list[AxisTask]) -> frozenset[int]:
+        """Return the windows in which an axis or a motor exceeds its limits, and those before."""
+        axis, (x, y) = self._axes[0], (command.position_mm for command, _, _ in found)
+        asked = [(x, tasks[0].bounds), (y, tasks[1].bounds)]
+        asked += [(x + y, self._motors), (x - y, self._motors)]
+        return frozenset().union(*(axis.windows_outside(bounds, row) for row, bounds in asked))
 
     def contour_square(
         self, y_d_mm: Array, command_mm: Array, extruding: NDArray[np.bool_]
@@ -258,8 +303,7 @@ class PreviewFbf:
             high_mm=max(travel.max_mm, asked.high_mm),
         )
 
-    def _ladder(self, axis: PreviewAxis, task: AxisTask) -> tuple[AxisCommand, int, frozenset[int]]:
-        """Return command, rung and the windows solved within bounds."""
+    def _ladder(self, axis: PreviewAxis, task: AxisTask) -> _Found:
         dt, bounds = self._dt_s, task.bounds
         rung, last = axis.rung, axis.last_rung
         careful: frozenset[int] = frozenset()

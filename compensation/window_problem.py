@@ -77,6 +77,10 @@ class Bounds:
         """Return the bounds for positions relative to an origin."""
         return replace(self, low_mm=self.low_mm - origin_mm, high_mm=self.high_mm - origin_mm)
 
+    def at_most(self, accel: float, speed: float) -> Bounds:
+        """Return the bounds with at most this acceleration and speed."""
+        return replace(self, accel=min(self.accel, accel), speed=min(self.speed, speed))
+
     def table(self) -> Array:
         """Return lowest and highest increment, step and position, margins and scales, (3, 4)."""
         return np.array(

@@ -335,6 +335,7 @@ def _strong(machine: Machine) -> Machine:
         update={
             "velocity_mm_s": max(default.velocity_mm_s, own.velocity_mm_s),
             "accel_mm_s2": max(default.accel_mm_s2, own.accel_mm_s2),
+            "motors": None,
         }
     )
     return machine.model_copy(update={"command": command})

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from stillpath.compensation.friction import FrictionCompensator, against_friction
 from stillpath.compensation.registry import compensator
 from stillpath.models.friction import DryFriction
-from stillpath.models.machine import Machine
+from stillpath.models.machine import CommandLimits, Machine
 from stillpath.models.reference_motion import reference_motion
 from stillpath.models.store import load_machine
 from stillpath.simulation.measures import contour_error
@@ -100,3 +102,26 @@ def test_one_place_at_the_limit_costs_no_more_than_this_place() -> None:
     free = against_friction(wanted, MACHINE.friction_mm, none, DT_S)
     same = np.all(np.abs(command - free) < 1e-9, axis=0)
     assert 0.8 < np.mean(same) < 1.0
+
+
+def test_x_and_y_together_ask_no_more_of_a_motor_than_it_bears() -> None:
+    """Both motors of a CoreXY move either axis: what each axis bears may be too much for them."""
+    t = np.arange(2000) * DT_S
+    path = 60.0 + 10.0 * np.stack([np.sin(6 * np.pi * t), np.sin(6 * np.pi * t)])
+    inner = SimpleNamespace(name="as planned", lead_s=0.0, tail_s=0.0, compensate=lambda y, *_: y)
+
+    def asked_mm_s2(command: np.ndarray) -> float:
+        motors = np.array([[1.0, 1.0], [1.0, -1.0]]) @ command
+        return float(np.abs(np.diff(motors, 2, axis=1)).max()) / DT_S**2
+
+    def made(**limits: object) -> np.ndarray:
+        command = CommandLimits.model_validate({"accel_mm_s2": 4500.0, **limits})
+        machine = rubbing(0.015, 0.015).model_copy(update={"command": command})
+        one = FrictionCompensator(inner, machine, DT_S)  # type: ignore[arg-type]
+        return one.compensate(path, np.ones(len(t), np.bool_), np.zeros((0, 2), np.int64))
+
+    limit = 1.02 * asked_mm_s2(path)
+    assert asked_mm_s2(made()) > 1.05 * limit
+    held = made(motors={"accel_mm_s2": limit})
+    assert asked_mm_s2(held) <= limit
+    assert np.abs(held - path).max() == pytest.approx(0.015, rel=0.05)

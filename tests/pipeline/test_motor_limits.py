@@ -36,6 +36,13 @@ def heavy_bed(kind: str) -> Machine:
     return with_command(ender3_with(kind), accel_mm_s2=4000, speed_step_mm_s=30, axes=bears_more)
 
 
+def slow_corexy() -> Machine:
+    machine = load_machine("voron-v24-250")
+    planner = machine.firmware.planner.model_copy(update={"max_accel_mm_s2": 3000.0})  # type: ignore[union-attr]
+    firmware = machine.firmware.model_copy(update={"planner": planner})
+    return machine.model_copy(update={"firmware": firmware})
+
+
 def peaks(made: CompensatedPiece) -> NDArray[np.float64]:
     return np.abs(np.diff(made.command_mm[:2], 2)).max(axis=1) / DT_S**2
 
@@ -77,10 +84,7 @@ def test_both_axes_alike_is_the_same_as_no_axes() -> None:
 
 
 def test_no_motor_of_a_corexy_is_asked_for_more_than_it_bears() -> None:
-    machine, accel = load_machine("voron-v24-250"), 4500.0
-    planner = machine.firmware.planner.model_copy(update={"max_accel_mm_s2": 3000.0})  # type: ignore[union-attr]
-    firmware = machine.firmware.model_copy(update={"planner": planner})
-    machine = machine.model_copy(update={"firmware": firmware})
+    machine, accel = slow_corexy(), 4500.0
     loose = with_command(machine, accel_mm_s2=accel)
     held = with_command(machine, accel_mm_s2=accel, motors={"accel_mm_s2": 1.42 * accel})
 
@@ -90,6 +94,23 @@ def test_no_motor_of_a_corexy_is_asked_for_more_than_it_bears() -> None:
 
     assert asked(loose) > 1.44 * accel
     assert asked(held) <= 1.42 * accel * (1 + 1e-9)
+
+
+def test_one_corner_of_a_corexy_costs_only_its_surroundings() -> None:
+    """Where X and Y together ask too much of a motor; the rest stays as it would be without."""
+    machine, accel = slow_corexy(), 4500.0
+    loose = with_command(machine, accel_mm_s2=accel)
+    held = with_command(machine, accel_mm_s2=accel, motors={"accel_mm_s2": 1.42 * accel})
+    straight = "".join(f"G1 X{20 + 70 * (k % 2)} Y20 E2 F6000\n" for k in range(1, 12))
+    commands = [
+        compensated(HEAD + CORNERS + straight + CORNERS, which)[1].command_mm[:2]
+        for which in (loose, held)
+    ]
+    n = commands[0].shape[1]
+    assert commands[1].shape[1] == n
+    apart = np.abs(commands[1] - commands[0]).max(axis=0)
+    assert apart.max() > 1e-3
+    assert apart[int(0.35 * n) : int(0.65 * n)].max() < 1e-6
 
 
 @pytest.mark.parametrize(("motor", "left"), [(8000.0, 5656.854), (30_000.0, 8000.0)])
