@@ -23,7 +23,7 @@ from stillpath.models.store import load_machine
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.piece_compensator import CompensatedPiece, PieceCompensator, deviation
-from tests.gcode.cutting import HEAD, blocks_of, pieces_of
+from tests.gcode.cutting import HEAD, blocks_of, compensated, pieces_of
 
 BODIES = {
     "corners": "G1 X80 Y60 E1 F6000\nG1 X60 Y80 E1\nG1 X60 Y60 E1\n",
@@ -55,6 +55,26 @@ def work(machine: Machine) -> PieceCompensator:
 def made(work: PieceCompensator, piece: Piece) -> CompensatedPiece:
     work.compensator.reset(piece.moves.start_mm[0, :2])
     return work.compensate(piece)
+
+
+def test_reversals_in_a_row_are_on_time(machine: Machine) -> None:
+    """A thin wall filled to and fro, by motors that can do little more than the file asks.
+
+    A segment before a reversal cannot be left faster than the reversal is entered. Segments that
+    were asked for more made the others miss their times, and the whole piece stayed as sliced.
+    """
+    zigzag = "".join(
+        f"G1 X{60 + 0.45 * k + 2.2 * (k % 2):.2f} Y{50 + 2.2 * (k % 2)} E.08 F6000\n"
+        for k in range(1, 200)
+    )
+    command = machine.command.model_copy(update={"accel_mm_s2": 7500.0, "speed_step_mm_s": 30.0})
+    firmware = machine.firmware
+    assert firmware.kind == "klipper"
+    planner = firmware.planner.model_copy(update={"max_accel_mm_s2": 5000.0})
+    firmware = firmware.model_copy(update={"planner": planner})
+    limited = machine.model_copy(update={"command": command, "firmware": firmware})
+    _, written = compensated(HEAD + zigzag, limited)
+    assert deviation(written, written.encoded.phases).max() < 8e-3
 
 
 @pytest.mark.parametrize("name", sorted(BODIES))

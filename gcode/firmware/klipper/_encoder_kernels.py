@@ -35,19 +35,13 @@ def expected_braking(
 
     See `assign_speeds`; `braking_s` is what it starts from.
     """
-    length_mm, accel_mm_s2, speed_mm_s, junction_mm_s = allowed
-    count = len(length_mm)
-    for i in range(count):
+    length_mm, accel_mm_s2, speed_mm_s = allowed.length_mm, allowed.accel_mm_s2, allowed.speed_mm_s
+    for i in range(len(length_mm)):
         braking_s[i] = 0.0
         if not ours[i]:
             continue
         v = min(length_mm[i] / planned_s[i], speed_mm_s[i])
-        leave = 0.0
-        if i + 1 < count and not stops[i + 1]:
-            follows = speed_mm_s[i + 1]
-            if ours[i + 1]:
-                follows = min(length_mm[i + 1] / planned_s[i + 1], follows)
-            leave = min(v, follows, junction_mm_s[i + 1])
+        leave = min(v, _leaving_mm_s(i, ours, stops, allowed, planned_s))
         lost = (v - leave) ** 2 / (2.0 * accel_mm_s2[i] * v)
         braking_s[i] = min(lost, MOST_LOST * planned_s[i])
 
@@ -144,6 +138,8 @@ def assign_speeds(
         known = braking_s[i] - (braking_s[i - 1] if chained else 0.0)
         brakes = 1.0 / (2.0 * before_accel * before) if before > 0.0 else 0.0
         most_braking = MOST_LOST * planned_s[i - 1] if chained else np.inf
+        leave = _leaving_mm_s(i, ours, stops, allowed, planned_s)
+        brakable2 = leave * leave + twice_accel * length_mm[i]
         v = length_mm[i] / available
         for _ in range(_ROUNDS):
             corner = min(v, before, junction_mm_s[i])
@@ -152,8 +148,8 @@ def assign_speeds(
                 lost += (v - corner) ** 2 / (twice_accel * v)
             last = v
             v = min(length_mm[i] / (available - min(lost, MOST_LOST * available)), speed_mm_s[i])
-            # No faster than reachable within its length, where the formula is still valid.
-            fastest2 = corner * corner + twice_accel * length_mm[i]
+            # No faster than reached and left within its length, where the formula is still valid.
+            fastest2 = min(corner * corner + twice_accel * length_mm[i], brakable2)
             if v * v > fastest2:
                 v = np.sqrt(fastest2)
             if abs(v - last) < _SETTLED_MM_S:
@@ -176,6 +172,23 @@ def assign_speeds(
     if count > 0 and ours[count - 1]:
         predicted_s[count - 1] += before / (2.0 * before_accel) - braking_s[count - 1]
         braking_s[count - 1] = before / (2.0 * before_accel)
+
+
+@kernel(allocates=False)
+def _leaving_mm_s(
+    i: int,
+    ours: NDArray[np.bool_],
+    stops: NDArray[np.bool_],
+    allowed: MoveLimits,
+    planned_s: NDArray[np.float64],
+) -> float:
+    """Largest speed at the end of segment i if the next one is on time."""
+    if i + 1 == len(ours) or stops[i + 1]:
+        return 0.0
+    leave = min(allowed.speed_mm_s[i + 1], allowed.junction_mm_s[i + 1])
+    if ours[i + 1]:
+        leave = min(leave, allowed.length_mm[i + 1] / planned_s[i + 1])
+    return float(leave)
 
 
 @kernel(allocates=False)
