@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillpath.compensation.base import Compensator
+from stillpath.compensation.limits import CommandBounds
 from stillpath.models.machine import Machine
 from stillpath.models.schedule import OperatingPoint
 
@@ -17,7 +18,8 @@ Array = NDArray[np.float64]
 class Overlay:
     """Base of compensators that add to the command of another one.
 
-    The inner compensator does not see the addition: its state follows its own command.
+    The inner compensator does not see the addition: its state follows its own command. That may
+    exceed the limits; the addition must not make it worse.
 
     Parameters
     ----------
@@ -32,9 +34,7 @@ class Overlay:
     def __init__(self, inner: Compensator, machine: Machine, dt_s: float) -> None:
         self.lead_s, self.tail_s = inner.lead_s, inner.tail_s
         self._inner, self._dt_s = inner, dt_s
-        limits = [machine.command.of("x"), machine.command.of("y")]
-        self._speed_mm_s = np.array([one.velocity_mm_s for one in limits])
-        self._accel_mm_s2 = np.array([one.accel_mm_s2 for one in limits])
+        self._bounds = CommandBounds(machine, dt_s)
 
     def reset(self, position_mm: Array) -> None:
         """See `compensation.base.Compensator.reset`."""
@@ -55,19 +55,3 @@ class Overlay:
     def ease(self, accel_share: float) -> bool:
         """See `compensation.base.Compensator.ease`."""
         return self._inner.ease(accel_share)
-
-    def _beyond(self, u: Array, wanted: Array) -> NDArray[np.bool_]:
-        """Return where a command exceeds an axis' limits and all that `wanted` needs, (2, n).
-
-        The inner compensator may exceed the limits; the addition must not make that worse.
-        """
-        beyond = np.zeros(u.shape, np.bool_)
-        for order, limits in ((1, self._speed_mm_s), (2, self._accel_mm_s2)):
-            asked, own = (np.abs(np.diff(rows, order)) / self._dt_s**order for rows in (u, wanted))
-            most = np.maximum(own.max(axis=1, initial=0.0), limits)
-            beyond[:, order:] |= asked > most[:, None]
-        return beyond
-
-    def _kept(self, u: Array, wanted: Array) -> bool:
-        """Return whether a command keeps each axis' limits, or needs no more than `wanted`."""
-        return not self._beyond(u, wanted).any()
