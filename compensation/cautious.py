@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.fbf import PreviewFbf
-from stillpath.compensation.limits import CommandBounds, eased
 from stillpath.compensation.preview_axis import GENTLE_RUNG
 from stillpath.compensation.shapers import ShaperCompensator
 from stillpath.models.machine import Machine
@@ -51,8 +50,7 @@ class CautiousFbf:
     """share * filtered basis functions + (1 - share) * shaper, axis by axis.
 
     A shaper needs no more than the path: where the motors cannot follow any command of filtered
-    basis functions, or only one that is less accurate, the shaper's is used; around places where
-    X and Y together ask too much of a motor too.
+    basis functions, or only one that is less accurate, the shaper's is used.
 
     Parameters
     ----------
@@ -78,7 +76,6 @@ class CautiousFbf:
         self._smoothing = ShaperCompensator(
             machine, dt_s, shaper=caution.shaper, fx_hz=caution.fx_hz, fy_hz=caution.fy_hz
         )
-        self._bounds, self._dt_s = CommandBounds(machine, dt_s), dt_s
         self._shares = np.array(caution.shares)[:, None]
         self._shaper_alone = False
         self._last = np.zeros((2, 0))
@@ -116,7 +113,6 @@ class CautiousFbf:
         if not self._shaper_alone and self._shares.any():
             exact = self._inner.compensate(y_d_mm, extruding, rests)
             mixed = self._shares * exact + (1.0 - self._shares) * smooth
-            mixed = eased(mixed, smooth, self._bounds.beyond, self._dt_s)
             # A gentler design than the one for which the shares were chosen may be worse.
             gentler = max(self._inner.rungs) > GENTLE_RUNG
             if not gentler or self._better(mixed, smooth, y_d_mm, extruding):

@@ -16,8 +16,8 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _ROUNDED = 1.0 + 1e-9
-_REACH_S = 0.016
-"""A command is replaced within twice this of a place, and partly within twice as much."""
+_REACH_S = 0.032
+"""A command is replaced this far from a place beyond the limits, and partly twice as far."""
 _PASSES = 4
 """The way over to a gentler command may exceed the limits too; then it begins earlier."""
 
@@ -34,47 +34,36 @@ class CommandBounds:
 
     def __init__(self, machine: Machine, dt_s: float) -> None:
         limits = machine.command
-        axes = [limits.of("x"), limits.of("y")]
-        self._axes = [[getattr(one, name) * dt_s**k for one in axes] for name, k in _ORDERS]
-        motors = limits.motors
+        axes, motors = [limits.of("x"), limits.of("y")], limits.motors
+        self._axes = [
+            np.array([getattr(axis, name) for axis in axes]) * dt_s**order
+            for order, name in enumerate(_LIMITS, 1)
+        ]
         self._motors = [
-            None if motors is None or (most := getattr(motors, name)) is None else most * dt_s**k
-            for name, k in _ORDERS
+            (getattr(motors, name, None) or np.inf) * dt_s**order
+            for order, name in enumerate(_LIMITS, 1)
         ]
 
-    def beyond(self, u_mm: Array, wanted_mm: Array | None = None) -> Mask:
-        """Return where a command (2, n) exceeds the limits, shape (2, n).
+    def beyond(self, u_mm: Array, wanted_mm: Array) -> Mask:
+        """Return where a command exceeds the limits and all that another one needs, shape (2, n).
 
-        Both rows are marked where X and Y together ask too much of a motor of a CoreXY.
+        Both axes are marked where together they ask too much of a motor of a CoreXY.
 
         Parameters
         ----------
-        wanted_mm : ndarray, shape (2, n), optional
-            What this one needs anywhere is allowed everywhere.
+        u_mm, wanted_mm : ndarray, shape (2, n)
         """
         beyond = np.zeros(u_mm.shape, np.bool_)
-        for order, axes, motors in zip((1, 2), self._axes, self._motors, strict=True):
-            for mixed, most in ((_separate, np.array(axes)), (_together, motors)):
-                if most is None:
-                    continue
-                if wanted_mm is not None:
-                    own = np.abs(np.diff(mixed(wanted_mm), order)).max(axis=1, initial=0.0)
-                    most = np.maximum(own, most)
-                over = np.abs(np.diff(mixed(u_mm), order)) > _ROUNDED * np.reshape(most, (-1, 1))
-                beyond[:, order:] |= over if mixed is _separate else over.any(axis=0)
+        for order, (axes, motors) in enumerate(zip(self._axes, self._motors, strict=True), 1):
+            beyond[:, order:] |= _exceeds(u_mm, wanted_mm, axes, order)
+            if np.isfinite(motors):
+                over = _exceeds(_of_motors(u_mm), _of_motors(wanted_mm), motors, order)
+                beyond[:, order:] |= over.any(axis=0)
         return beyond
 
 
-_ORDERS = (("velocity_mm_s", 1), ("accel_mm_s2", 2))
-
-
-def _separate(u_mm: Array) -> Array:
-    return u_mm
-
-
-def _together(u_mm: Array) -> Array:
-    """Return the way of the motors of a CoreXY."""
-    return np.stack([u_mm[0] + u_mm[1], u_mm[0] - u_mm[1]])
+_LIMITS = ("velocity_mm_s", "accel_mm_s2")
+"""Of first and second differences."""
 
 
 def eased(u_mm: Array, gentler_mm: Array, beyond: Callable[[Array], Mask], dt_s: float) -> Array:
@@ -85,13 +74,6 @@ def eased(u_mm: Array, gentler_mm: Array, beyond: Callable[[Array], Mask], dt_s:
             break
         u_mm = u_mm + _around(over, dt_s) * (gentler_mm - u_mm)
     return u_mm
-
-
-def _around(marked: Mask, dt_s: float) -> Array:
-    """Return 1 around marked samples, and less further away, shape (2, n)."""
-    reach = round(_REACH_S / dt_s)
-    near = maximum_filter1d(marked.astype(float), 4 * reach + 1, axis=1)
-    return np.stack([smoothed(row, window(2 * _REACH_S, dt_s)) for row in near])
 
 
 def window(length_s: float, dt_s: float) -> Array:
@@ -105,3 +87,21 @@ def smoothed(row: Array, weights: Array) -> Array:
     """Return a row (n,) averaged with a symmetric window, its ends continued."""
     half = len(weights) // 2
     return np.convolve(np.pad(row, half, mode="edge"), weights, mode="valid")
+
+
+def _exceeds(u: Array, wanted: Array, limits: Array | float, order: int) -> Mask:
+    asked, own = (np.abs(np.diff(rows, order)) for rows in (u, wanted))
+    most = np.maximum(own.max(axis=1, initial=0.0), limits)
+    return np.asarray(asked > _ROUNDED * most[:, None], np.bool_)
+
+
+def _of_motors(u_mm: Array) -> Array:
+    """Return the way of both motors of a CoreXY."""
+    return np.stack([u_mm[0] + u_mm[1], u_mm[0] - u_mm[1]])
+
+
+def _around(marked: Mask, dt_s: float) -> Array:
+    """Return 1 around marked samples, and less further away, shape (2, n)."""
+    reach = round(1.5 * _REACH_S / dt_s)
+    near = maximum_filter1d(marked.astype(float), 2 * reach + 1, axis=1)
+    return np.stack([smoothed(row, window(_REACH_S, dt_s)) for row in near])

@@ -75,3 +75,16 @@ def test_guides_that_do_not_rub_have_none() -> None:
     read = logs(smooth, OLD_TEST)
     assert dry_friction([one[1] for one in read], [[one[2] for one in read]]).held_mm < 2e-4
     assert mean_response([one[2] for one in read]).f_hz[0] < 10
+
+
+@pytest.mark.parametrize("times", [4.0, 8.0])
+def test_strong_friction_delays_the_fundamental_which_alignment_takes_for_a_later_start(
+    times: float,
+) -> None:
+    printer = draw("bed slinger", 3)
+    strong = tuple(replace(one, force_n=times * one.force_n) for one in printer.bodies.frictions)
+    printer = replace(printer, bodies=replace(printer.bodies, frictions=strong))
+    read = logs(printer, OLD_TEST)
+    found = dry_friction([one[1] for one in read], [[one[2] for one in read]])
+    assert found.held_mm == pytest.approx(held_mm(printer, 0), rel=0.3)
+    assert found.late_s > 0.0
