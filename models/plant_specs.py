@@ -41,7 +41,7 @@ SamplingTime = Annotated[float, Field(gt=1e-6, le=1.0, allow_inf_nan=False)]
 Complex = tuple[Finite, Finite]
 """Real and imaginary part."""
 
-MOST_FRICTION_MM = 0.02
+MOST_FRICTION_MM = 0.1
 """Guides that hold an axis back by more are to be mended, not compensated."""
 
 

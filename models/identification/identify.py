@@ -26,7 +26,7 @@ from stillpath.models.identification.estimation import (
     estimate_response,
 )
 from stillpath.models.identification.frame import LIKELY, likely_of
-from stillpath.models.identification.friction import dry_friction, freed
+from stillpath.models.identification.friction import Friction, dry_friction, freed
 from stillpath.models.identification.messages import (
     body_notes,
     by_file,
@@ -72,6 +72,7 @@ from stillpath.models.identification.types import (
     PlantModel,
     Spectrum,
 )
+from stillpath.models.plants import PlantSetSpec
 from stillpath.models.provenance import Kind, SourceFile
 
 __all__ = ["Measured", "Progress", "identify"]
@@ -183,6 +184,7 @@ class _AxisWork:
         self._max_order = max_order
         self._aligned: list[AlignedLog] = []
         """Of the raw logs that are used."""
+        self._friction_mm = 0.0
         self._spectra: list[tuple[Spectrum, Excitation, Condition]] = []
         self._explanations: Explanations | None = None
         kind = next(k for k in _BEST_FIRST if any(isinstance(m.measurement, k) for m in measured))
@@ -254,12 +256,11 @@ class _AxisWork:
         common = usual([c for _, c in responses], self._axis)
         # A schedule counts the modes of the plant as it was fitted.
         frame_firm = self._settings.frame_firm or bool(special([c for _, c in responses]))
-        friction_mm = 0.0
         frame: Frame | None = None
         if self._kind == "raw log":
             frame = None if frame_firm else _frame(responses, common)
-            responses, friction_mm = self._without_friction(responses, common, frame)
-            if friction_mm and not frame_firm:
+            responses = self._without_friction(responses, common, frame)
+            if self._friction_mm and not frame_firm:
                 frame = _frame(responses, common)
         chosen = [r for r, c in responses if c in common]
         if frame is not None:
@@ -284,12 +285,12 @@ class _AxisWork:
         if self._kind == "raw log":
             warnings = level_warnings(chosen, nominal)
             mounting = [] if self._settings.sensor_axis else mounting_notes(self._axis, chosen)
-            notes = [*mounting, *body_notes(friction_mm, frame)]
+            notes = [*mounting, *body_notes(self._friction_mm, frame)]
         else:
             warnings = scale_warnings(chosen, nominal)
         found = replace(
             found,
-            plants=found.plants.model_copy(update={"friction_mm": friction_mm or None}),
+            plants=self._rubbing(found.plants),
             measured=(*found.measured, *others),
             warnings=(*found.warnings, *warnings),
             notes=tuple(notes),
@@ -341,7 +342,12 @@ class _AxisWork:
         ]
         self._explanations = self._explained()
         found = self._from_spectra(frame_likely)
-        return replace(found, warnings=(*found.warnings, phase_warning(self._axis, poor)))
+        return replace(
+            found,
+            plants=self._rubbing(found.plants),
+            notes=(*found.notes, *body_notes(self._friction_mm, None)),
+            warnings=(*found.warnings, phase_warning(self._axis, poor)),
+        )
 
     def _explained(self) -> Explanations:
         """Return what explains the spectra without a condition of their own."""
@@ -391,38 +397,42 @@ class _AxisWork:
         responses: Sequence[tuple[FrequencyResponse, Condition]],
         common: Collection[Condition],
         frame: Frame | None,
-    ) -> tuple[list[tuple[FrequencyResponse, Condition]], float]:
-        """Return responses corrected for dry friction, and its size.
+    ) -> list[tuple[FrequencyResponse, Condition]]:
+        """Return responses corrected for dry friction, and keep its size.
 
         Guides slide relative to the frame, but a sensor also measures the frame's motion.
         """
         used = [k for k, (_, c) in enumerate(responses) if c in common]
         felt = [r for r, _ in responses]
         motions = [felt] if frame is None else [felt, [frame.over_bed(r) for r in felt]]
-        held_mm, which = dry_friction(
+        found = dry_friction(
             [self._aligned[k] for k in used], [[way[k] for k in used] for way in motions]
         )
-        if held_mm:
-            responses = [
-                (self._freed(k, response, motions[which][k], held_mm), condition)
-                for k, (response, condition) in enumerate(responses)
-            ]
-        return list(responses), held_mm
+        self._friction_mm = found.held_mm
+        if not found.held_mm:
+            return list(responses)
+        return [
+            (self._freed(k, response, motions[found.motion][k], found), condition)
+            for k, (response, condition) in enumerate(responses)
+        ]
 
     def _freed(
         self,
         number: int,
         response: FrequencyResponse,
         motion: FrequencyResponse,
-        friction_mm: float,
+        friction: Friction,
     ) -> FrequencyResponse:
         """Return the response of a log corrected for dry friction of a motion over the frame."""
         log = self._used[number].measurement
         assert isinstance(log, AccelerationLog)
-        aligned = freed(self._aligned[number], motion, friction_mm)
+        aligned = freed(self._aligned[number], motion, friction)
         test = excitation_for(log, self._settings)
         again = estimate_aligned(log, aligned, test, label=response.label)
         return replace(again, notes=response.notes)
+
+    def _rubbing(self, plants: PlantSetSpec) -> PlantSetSpec:
+        return plants.model_copy(update={"friction_mm": self._friction_mm or None})
 
 
 def _frame(

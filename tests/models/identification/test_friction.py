@@ -46,8 +46,8 @@ def logs(  # type: ignore[no-untyped-def]
 def test_it_is_told_by_the_log(test: Excitation) -> None:
     printer = draw("bed slinger", 3)
     read = logs(printer, test, runs=2)
-    found, _ = dry_friction([one[1] for one in read], [[one[2] for one in read]])
-    assert found == pytest.approx(held_mm(printer, 0), rel=0.3)
+    found = dry_friction([one[1] for one in read], [[one[2] for one in read]])
+    assert found.held_mm == pytest.approx(held_mm(printer, 0), rel=0.3)
     # What is left follows the command better.
     log, aligned, response = read[0]
     again = estimate_aligned(log, freed(aligned, response, found), test)
@@ -64,14 +64,27 @@ def test_a_frame_that_shakes_does_not_hide_it(seed: int) -> None:
     frame = frame_of(mean_response(felt))
     assert frame is not None
     over_it = [frame.over_bed(response) for response in felt]
-    found, motion = dry_friction([one[1] for one in read], [felt, over_it])
-    assert found == pytest.approx(held_mm(printer, 1), rel=0.3)
-    assert motion == 1
+    found = dry_friction([one[1] for one in read], [felt, over_it])
+    assert found.held_mm == pytest.approx(held_mm(printer, 1), rel=0.3)
+    assert found.motion == 1
 
 
 def test_guides_that_do_not_rub_have_none() -> None:
     printer = draw("corexy", 3)
     smooth = replace(printer, bodies=replace(printer.bodies, frictions=()))
     read = logs(smooth, OLD_TEST)
-    assert dry_friction([one[1] for one in read], [[one[2] for one in read]])[0] < 2e-4
+    assert dry_friction([one[1] for one in read], [[one[2] for one in read]]).held_mm < 2e-4
     assert mean_response([one[2] for one in read]).f_hz[0] < 10
+
+
+@pytest.mark.parametrize("times", [4.0, 8.0])
+def test_strong_friction_delays_the_fundamental_which_alignment_takes_for_a_later_start(
+    times: float,
+) -> None:
+    printer = draw("bed slinger", 3)
+    strong = tuple(replace(one, force_n=times * one.force_n) for one in printer.bodies.frictions)
+    printer = replace(printer, bodies=replace(printer.bodies, frictions=strong))
+    read = logs(printer, OLD_TEST)
+    found = dry_friction([one[1] for one in read], [[one[2] for one in read]])
+    assert found.held_mm == pytest.approx(held_mm(printer, 0), rel=0.3)
+    assert found.late_s > 0.0
