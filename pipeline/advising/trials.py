@@ -220,12 +220,9 @@ def _planned(sample: Sample, advice: Advice, machine: Machine, adviser: Adviser)
     changed = np.flatnonzero(~np.isnan(wanted) & (wanted != file))
     if not len(changed):
         return piece.phases
-    limits, limits_id = list(piece.limits), moves.limits_id.copy()
-    made: dict[tuple[int, float], int] = {}
-    for k in changed.tolist():
-        key = (int(moves.limits_id[k]), float(wanted[k]))
-        if key not in made:
-            made[key] = len(limits)
-            limits.append(adviser.with_accel(piece.limits[key[0]], key[1]))
-        limits_id[k] = made[key]
+    pairs = list(zip(moves.limits_id[changed].tolist(), wanted[changed].tolist(), strict=True))
+    numbers = {pair: len(piece.limits) + n for n, pair in enumerate(dict.fromkeys(pairs))}
+    limits = [*piece.limits, *(adviser.with_accel(piece.limits[k], a) for k, a in numbers)]
+    limits_id = moves.limits_id.copy()
+    limits_id[changed] = [numbers[pair] for pair in pairs]
     return plan_moves(replace(moves, limits_id=limits_id), limits, machine)
