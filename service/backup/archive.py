@@ -21,8 +21,9 @@ from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from typing import IO
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import ValidationError
 
+from stillpath.models.document import Document
 from stillpath.pipeline.files import replacing, sync
 from stillpath.service.instance_lock import exclusive
 from stillpath.version import __version__
@@ -42,10 +43,8 @@ class BackupError(Exception):
     """It cannot be backed up or restored; the message says what to do."""
 
 
-class Manifest(BaseModel):
+class Manifest(Document):
     """What an archive holds: SHA-256 and size in bytes of every file."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     version: str
     jobs: int
