@@ -176,6 +176,15 @@ def test_the_filter_is_kept_and_made_again_if_damaged(
     assert again.contour_um == first.contour_um
 
 
+@pytest.mark.slow
+def test_dry_friction_is_in_what_a_filter_leaves(machine: Machine, cache: Path) -> None:
+    """No filter makes up for it."""
+    axes = {k: v.model_copy(update={"friction_mm": 0.03}) for k, v in machine.axes.items()}
+    rubbing = machine.model_copy(update={"axes": axes})
+    clean, rubbed = (cached_live_design(one, cache).contour_um for one in (machine, rubbing))
+    assert rubbed["live"][0] > clean["live"][0] + 10.0
+
+
 def test_the_comparison_is_no_setting_of_the_written_file(machine: Machine) -> None:
     assert stamp(machine, BOTH) == stamp(machine, Options())
     assert "compare_live" not in Options().model_dump()
