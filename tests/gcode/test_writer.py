@@ -252,7 +252,7 @@ def test_shaper_of_the_file_is_restored(pipeline: Pipeline) -> None:
     assert written.index(b"SHAPER_FREQ_X=0") < written.rindex(line) < written.rindex(b"G28")
 
 
-def test_rests_run_under_the_limits_of_the_file(pipeline: Pipeline, machine: Machine) -> None:
+def test_rests_run_under_the_limits_of_the_file(pipeline: Pipeline) -> None:
     """What we did not write must not meet our limits: retractions, hops, and after an M204."""
     rest = "G1 E-1 F2100\nG1 Z5.4 F600\nM204 S1500\nG1 Z5 F600\nG1 E1 F2100\n"
     lines = pipeline(tagged((HEAD + ROUND + rest + ROUND + "G4 P1\n").encode())).splitlines()

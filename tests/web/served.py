@@ -32,7 +32,6 @@ SERVE = [
 ]
 PATIENCE_MS = 240_000
 """For whatever a job or an identification takes on a loaded machine."""
-_ADDRESS = re.compile(r"stillpath: (http\S+?)/?\s*$")
 
 
 @dataclass(frozen=True)
