@@ -10,13 +10,13 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import math
 import os
 import sys
 import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +30,7 @@ from stillpath.models.machine import Machine
 from stillpath.models.plants import Mode, ModesSpec, ParametricMembers, PlantSetSpec, plant_set
 from stillpath.models.reference_motion import reference_motion
 from stillpath.models.store import load_machine
-from stillpath.pipeline.measuring.reference_shaper import FREQUENCIES_HZ
+from stillpath.pipeline.measuring.reference_shaper import FREQUENCIES_HZ, descend, shaped_at
 from stillpath.simulation.measures import PathDistances, tracking_error
 from stillpath.simulation.response import response
 
@@ -217,60 +217,36 @@ class Trial:
         """Return a function of two frequency numbers: contour rms [um], about `points` points."""
         index = self._index[:: max(1, len(self._index) // points)]
         path = self._motion.position_mm
-        rows: dict[tuple[int, int], list[Array]] = {}
-        found: dict[tuple[int, int], Array] = {}
 
+        @cache
         def axis(number: int, k: int) -> list[Array]:
-            if (number, k) not in rows:
-                pulses = shaper_pulses(kind, float(FREQUENCIES_HZ[k]), _ZETA)
-                rows[number, k] = [_shaped_at(y[number], pulses, index) for y in self._answers]
-            return rows[number, k]
+            pulses = shaper_pulses(kind, float(FREQUENCIES_HZ[k]), _ZETA)
+            return [shaped_at(y[number], DT, pulses, index) for y in self._answers]
 
+        @cache
         def rms(i: int, j: int) -> Array:
-            if (i, j) not in found:
-                pairs = zip(axis(0, i), axis(1, j), strict=True)
-                found[i, j] = 1e3 * np.array(
-                    [_rms(PathDistances(path, DT).at(np.stack(pair), index)) for pair in pairs]
-                )
-            return found[i, j]
+            pairs = zip(axis(0, i), axis(1, j), strict=True)
+            distances = PathDistances(path, DT)
+            return 1e3 * np.array([_rms(distances.at(np.stack(p), index)) for p in pairs])
 
         return rms
 
 
 def tune(trial: Trial, figure: Figure) -> tuple[str, int, int]:
     """Find the shaper and its two frequencies (2 % grid) that make a figure of the set smallest."""
-    best: tuple[float, str, int, int] = (math.inf, "", 0, 0)
+    return min(_tuned(trial, figure, kind) for kind in SHAPERS)[1:]
+
+
+def _tuned(trial: Trial, figure: Figure, kind: str) -> tuple[float, str, int, int]:
+    coarse, fine = (trial.shaper_rms(kind, n) for n in (_COARSE_POINTS, _FINE_POINTS))
+    # A coarse grid of pairs, and all pairs of equal frequencies.
     size = len(FREQUENCIES_HZ)
-    for kind in SHAPERS:
-        coarse, fine = (trial.shaper_rms(kind, n) for n in (_COARSE_POINTS, _FINE_POINTS))
-        # A coarse grid of pairs, and all pairs of equal frequencies.
-        steps = range(0, size, _COARSE_STEP)
-        starts = [*itertools.product(steps, steps), *((i, i) for i in range(size))]
-        here = min((figure(coarse(i, j)), i, j) for i, j in starts)[1:]
-        value = figure(fine(*here))
-        while True:
-            moves = itertools.product((-3, -1, 0, 1, 3), repeat=2)
-            around = [(here[0] + a, here[1] + b) for a, b in moves]
-            inside = [(i, j) for i, j in around if 0 <= i < size and 0 <= j < size]
-            lower, *there = min((figure(fine(i, j)), i, j) for i, j in inside)
-            if lower >= value:
-                break
-            value, here = lower, (there[0], there[1])
-        best = min(best, (value, kind, *here))
-    return best[1:]
-
-
-def _shaped_at(answer: Array, pulses: tuple[Array, Array], index: NDArray[np.int64]) -> Array:
-    """Shaped `answer` at the samples `index` only."""
-    weights, delays = pulses
-    shift, last, out = float(weights @ delays), len(answer) - 1, np.zeros(len(index))
-    for weight, delay in zip(weights, delays, strict=True):
-        late = (delay - shift) / DT
-        whole = math.floor(late)
-        part = late - whole
-        out += weight * (1 - part) * answer[np.clip(index - whole, 0, last)]
-        out += weight * part * answer[np.clip(index - whole - 1, 0, last)]
-    return out
+    grid = range(0, size, _COARSE_STEP)
+    starts = [*itertools.product(grid, grid), *((i, i) for i in range(size))]
+    start = min(starts, key=lambda pair: (figure(coarse(*pair)), pair))
+    steps = list(itertools.product((-3, -1, 0, 1, 3), (-3, -1, 0, 1, 3)))
+    i, j = descend(lambda i, j: figure(fine(i, j)), start, steps)
+    return figure(fine(i, j)), kind, i, j
 
 
 def _print_head() -> None:

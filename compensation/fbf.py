@@ -11,6 +11,7 @@ For a plant set the error along the path may count less than the error across it
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import replace
 from typing import Any, TypeAlias
 
@@ -304,47 +305,40 @@ class PreviewFbf:
         )
 
     def _ladder(self, axis: PreviewAxis, task: AxisTask) -> _Found:
+        """Return command, rung and the windows solved within bounds."""
+        for rung in range(axis.rung, axis.last_rung):
+            # A design may fail its acceptance where a gentler one does not.
+            with contextlib.suppress(DesignError):
+                return self._on_rung(axis, rung, task)
+        return self._on_rung(axis, axis.last_rung, task)
+
+    def _on_rung(self, axis: PreviewAxis, rung: int, task: AxisTask) -> _Found:
         dt, bounds = self._dt_s, task.bounds
-        rung, last = axis.rung, axis.last_rung
         careful: frozenset[int] = frozenset()
-        rounds = 0
-        asked = ""
-        while True:
-            try:
-                found = axis.command(rung, task, careful)
-            except DesignError:
-                # This design fails its acceptance; a gentler one may not.
-                if rung == last:
-                    raise
-                rung, careful, rounds = rung + 1, frozenset(), 0
-                continue
+        for _ in range(_BOUNDED_ROUNDS + 1):
+            found = axis.command(rung, task, careful)
             command = found.position_mm
             reached = Extremes.of(command, command[0], command[0], stops=True)
-            rms = np.sqrt(reached.mean_square) / dt**2
             if not careful:
-                asked = (
-                    f"{reached.accel / dt**2:.0f} mm/s2, {reached.speed / dt:.0f} mm/s and "
-                    f"{reached.low_mm:.3f} to {reached.high_mm:.3f} mm"
-                )
-            if rms <= task.rms_limit_mm_s2 or rung >= GENTLE_RUNG:
-                if bounds.kept(reached):
-                    # The next piece starts here, or on a more accurate rung if there is room.
-                    has_room = rms < 0.8 * task.rms_limit_mm_s2 or rung > GENTLE_RUNG
-                    if len(command) > axis.update:
-                        axis.next_rung = max(0, rung - 1) if has_room else rung
-                    return found, rung, careful
-                outside = axis.windows_outside(bounds, command)
-                few = len(careful | outside) <= max(2, _BOUNDED_SHARE * len(command) / axis.update)
-                if rounds < _BOUNDED_ROUNDS and not outside <= careful and (few or rung == last):
-                    careful |= outside
-                    rounds += 1
-                    continue
-            if rung == last:
+                asked = reached
+            rms = np.sqrt(reached.mean_square) / dt**2
+            if rms > task.rms_limit_mm_s2 and rung < GENTLE_RUNG:
                 break
-            rung, careful, rounds = rung + 1, frozenset(), 0
+            if bounds.kept(reached):
+                # The next piece starts here, or on a more accurate rung if there is room.
+                has_room = rms < 0.8 * task.rms_limit_mm_s2 or rung > GENTLE_RUNG
+                if len(command) > axis.update:
+                    axis.next_rung = max(0, rung - 1) if has_room else rung
+                return found, rung, careful
+            outside = axis.windows_outside(bounds, command)
+            few = len(careful | outside) <= max(2, _BOUNDED_SHARE * len(command) / axis.update)
+            if outside <= careful or not (few or rung == axis.last_rung):
+                break
+            careful |= outside
         raise DesignError(
-            f"axis {axis.name}: even the gentlest design asks for {asked}; allowed are "
-            f"{bounds.accel / dt**2:.0f} mm/s2, {bounds.speed / dt:.0f} mm/s and "
+            f"axis {axis.name}: even the gentlest design asks for {asked.accel / dt**2:.0f} mm/s2, "
+            f"{asked.speed / dt:.0f} mm/s and {asked.low_mm:.3f} to {asked.high_mm:.3f} mm; "
+            f"allowed are {bounds.accel / dt**2:.0f} mm/s2, {bounds.speed / dt:.0f} mm/s and "
             f"{bounds.low_mm:g} to {bounds.high_mm:g} mm (command and travel limits of the "
             "machine; docs/proof.md tells how to measure what its motors bear)"
         )

@@ -155,12 +155,6 @@ class ToeplitzOperator(LiftedOperator):
         row[1 : len(self.ahead) + 1] = self.ahead
         return np.asarray(toeplitz(self.markov, row), np.float64)
 
-    def truncated(self, samples: int) -> ToeplitzOperator:
-        """Return the same system over the first `samples` samples."""
-        if not 1 <= samples <= len(self.markov):
-            raise DesignError(f"{samples} of {len(self.markov)} samples: take 1 to all of them")
-        return ToeplitzOperator(self.markov[:samples], self.ahead[: samples - 1])
-
     @cached_property
     def _size(self) -> int:
         from scipy.fft import next_fast_len  # slow to import, seldom needed

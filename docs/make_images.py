@@ -354,7 +354,8 @@ def _um(values: Any) -> Sequence[float]:
     return rounded
 
 
-def _drawn(chart: Chart, width: float = 720.0, height: float = 320.0) -> str:
+def _drawn(chart: Chart) -> str:
+    width, height = 720.0, 320.0
     size = f'xmlns="http://www.w3.org/2000/svg" width="{width:g}" height="{height:g}"'
     drawn = draw(chart, width, height).replace("<svg ", f"<svg {size} ", 1)
     return drawn.replace(">", f"><style>{STYLE}</style>", 1)

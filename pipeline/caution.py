@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
@@ -37,14 +38,16 @@ from stillpath.simulation.response import response
 
 __all__ = [
     "Choice",
+    "Mixtures",
+    "Shares",
+    "best_shares",
     "caution_for",
     "choose_caution",
     "design_mode",
     "error_ranges",
     "measured_set",
-    "member_pairs",
     "most_share",
-    "pair_weights",
+    "nominal_response",
     "prediction_note",
     "set_or_nominal",
     "stated_note",
@@ -53,6 +56,8 @@ __all__ = [
 Array = NDArray[np.float64]
 T = TypeVar("T")
 Pair: TypeAlias = tuple[DiscretePlant, DiscretePlant]
+Shares: TypeAlias = tuple[float, float]
+"""Share of a command in its mixture with the shaper's, for X and Y."""
 
 _VERSION = 10
 _SHARES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.2, 0.0)
@@ -96,7 +101,7 @@ class Choice:
         By channel, the nominal plants' contour error on the reference motion [um].
     """
 
-    shares: tuple[float, float]
+    shares: Shares
     worst: float
     mean: float
     worst_to_none: float
@@ -237,68 +242,109 @@ def _read(document: dict[str, Any]) -> Choice:
     return Choice(**{**document, "shares": tuple(document["shares"]), "ranges": ranges})
 
 
+class Mixtures:
+    """Contour errors of mixtures on one motion, for every pair of members of X and Y.
+
+    Parameters
+    ----------
+    path_mm, smooth_mm : ndarray, shape (2, n)
+        The motion, and the shaper's command for it.
+    extruding : ndarray of bool, shape (n,)
+
+    Attributes
+    ----------
+    shaped_mm : ndarray, shape (pairs,)
+        Errors with the shaper.
+    """
+
+    def __init__(
+        self,
+        machine: Machine,
+        path_mm: Array,
+        extruding: NDArray[np.bool_],
+        smooth_mm: Array,
+        dt_s: float,
+    ) -> None:
+        self._at = np.flatnonzero(extruding).astype(np.int64)[::_STRIDE]
+        self._distances = PathDistances(path_mm, dt_s)
+        # A delay between the axes adds the same error to all commands: it cannot rank them.
+        axes = [machine.axes[axis].without_delay() for axis in ("x", "y")]
+        self._pairs = _side_by_side(*(plant_set(axis, dt_s).members for axis in axes))
+        self._weights = _pair_weights(machine, len(self._pairs))
+        self._smooth = self.answers(smooth_mm)
+        self.shaped_mm = np.maximum(self.errors_mm(self._smooth), 1e-12)
+
+    def answers(self, command_mm: Array) -> list[Array]:
+        """Return the motion of every pair at the measured points."""
+        return [response(pair, command_mm)[:, self._at] for pair in self._pairs]
+
+    def errors_mm(self, answers: Sequence[Array], shares: Shares = (1.0, 1.0)) -> Array:
+        """Return the rms error of every pair with a command, or with a mixture of it."""
+        a = np.array(shares)[:, None]
+        both = zip(answers, self._smooth, strict=True)
+        return np.array([self._rms(a * exact + (1.0 - a) * smooth) for exact, smooth in both])
+
+    def mean(self, values: Array) -> float:
+        """Return the weighted geometric mean over the pairs."""
+        return float(np.exp(self._weights @ np.log(values)))
+
+    def rms_mm(self, motion_mm: Array) -> float:
+        """Return the error of a motion (2, n)."""
+        return self._rms(motion_mm[:, self._at])
+
+    def _rms(self, points: Array) -> float:
+        return float(np.sqrt(np.mean(self._distances.at(points, self._at) ** 2)))
+
+
+def best_shares(cost: Callable[[Shares], float], most: Sequence[float]) -> Shares:
+    """Return the shares, up to `most`, of least cost: of both axes, then of each alone."""
+    best = min(((min(share, most[0]), min(share, most[1])) for share in _SHARES), key=cost)
+    for axis in (0, 1):
+        alone = [share for share in _SHARES if share <= most[axis]]
+        others = [(share, best[1]) if axis == 0 else (best[0], share) for share in alone]
+        best = min([best, *others], key=cost)
+    return best
+
+
 def _tried(machine: Machine, shaper: BestShaper, dt_s: float, basis: str) -> Choice:
     path, extruding = reference_motion_of(machine, dt_s)
     most_shares = [most_share(machine.axes[axis]) for axis in ("x", "y")]
-    commands = _commands(machine, shaper, basis, dt_s, fbf=any(most_shares))
-    at = np.flatnonzero(extruding).astype(np.int64)[::_STRIDE]
-    distances = PathDistances(path, dt_s)
-    answers = [
-        [response(pair, command)[:, at] for command in (*commands, path)]
-        for pair in member_pairs(machine, dt_s)
-    ]
+    exact, smooth = _commands(machine, shaper, basis, dt_s, fbf=any(most_shares))
+    mixtures = Mixtures(machine, path, extruding, smooth, dt_s)
+    exact_mm = mixtures.answers(exact)
+    none_mm = np.maximum(mixtures.errors_mm(mixtures.answers(path)), 1e-12)
 
-    def rms(points: Array) -> float:
-        error = distances.at(points, at)
-        return float(np.sqrt(np.mean(error**2)))
-
-    weights = pair_weights(machine, len(answers))
-    shaped = np.array([rms(smooth_mm) for _, smooth_mm, _ in answers])
-    none = np.array([rms(none_mm) for _, _, none_mm in answers])
-
-    def evaluate(shares: tuple[float, float]) -> Choice:
-        a = np.array(shares)[:, None]
-        ours = np.array(
-            [rms(a * exact_mm + (1 - a) * smooth_mm) for exact_mm, smooth_mm, _ in answers]
-        )
-        ratio = ours / np.maximum(shaped, 1e-12)
+    @cache
+    def choice(shares: Shares) -> Choice:
+        ours_mm = np.maximum(mixtures.errors_mm(exact_mm, shares), 1e-12)
+        ratio = ours_mm / mixtures.shaped_mm
         return Choice(
             shares,
             float(ratio.max()),
-            float(np.exp(weights @ np.log(ratio))),
-            float(np.max(ours / np.maximum(none, 1e-12))),
-            float(1e3 * np.exp(weights @ np.log(np.maximum(ours, 1e-12)))),
+            mixtures.mean(ratio),
+            float(np.max(ours_mm / none_mm)),
+            1e3 * mixtures.mean(ours_mm),
         )
 
-    mixtures = [
-        evaluate((min(share, most_shares[0]), min(share, most_shares[1]))) for share in _SHARES
-    ]
-    best = min(mixtures, key=_rank)
-    for i in (0, 1):
-        others = [
-            evaluate((share, best.shares[1]) if i == 0 else (best.shares[0], share))
-            for share in _SHARES
-            if share <= most_shares[i]
-        ]
-        best = min([best, *others], key=_rank)
+    best = choice(best_shares(lambda shares: _rank(choice(shares)), most_shares))
     a = np.array(best.shares)[:, None]
-    mixed = a * commands[0] + (1 - a) * commands[1]
+    mixed = a * exact + (1.0 - a) * smooth
     channels = {
         "before": path,
         "after": against_friction(mixed, machine.friction_mm, _NO_RESTS, dt_s),
-        "shaper": commands[1],
+        "shaper": smooth,
     }
     return replace(
         best,
-        ranges=error_ranges(machine, channels, lambda y: rms(y[:, at]), dt_s),
+        ranges=error_ranges(machine, channels, mixtures.rms_mm, dt_s),
         reference_um={
-            name: 1e3 * rms(_nominal(machine, command, dt_s)[:, at])
+            name: 1e3 * mixtures.rms_mm(nominal_response(machine, command, dt_s))
             for name, command in channels.items()
         },
     )
 
 
-def _nominal(machine: Machine, command: Array, dt_s: float) -> Array:
+def nominal_response(machine: Machine, command: Array, dt_s: float) -> Array:
     """Return the nominal plants' response to a command, dry friction included."""
     pair = [plant_set(machine.axes[axis], dt_s).nominal for axis in ("x", "y")]
     return response(pair, _received(machine, command))
@@ -362,7 +408,7 @@ def error_ranges(
     lag_s = 0.0 if any(map(_unseen, machine.axes.values())) else _LAG_UNSURE_S
     out = {}
     for name, command in commands.items():
-        nominal = max(rms(_nominal(machine, command, dt_s)), 1e-12)
+        nominal = max(rms(nominal_response(machine, command, dt_s)), 1e-12)
         ratios = []
         for pair, side in zip(pairs, sides, strict=True):
             received = _received(machine, command, 1.0 + _FRICTION_UNSURE * side)
@@ -403,7 +449,7 @@ def _unseen(axis: PlantSetSpec) -> bool:
     return about is None or about.magnitude_only or stated_hz(axis) is not None
 
 
-def pair_weights(machine: Machine, count: int) -> Array:
+def _pair_weights(machine: Machine, count: int) -> Array:
     """Return the weight of each pair: the geometric mean of its members' weights, normalised.
 
     Members are paired by their place in the sets, so this is no joint probability: with the root,
@@ -414,13 +460,6 @@ def pair_weights(machine: Machine, count: int) -> Array:
     )
     both = np.array([x[j % len(x)] * y[j % len(y)] for j in range(count)])
     return np.asarray(np.sqrt(both) / np.sqrt(both).sum())
-
-
-def member_pairs(machine: Machine, dt_s: float) -> list[Pair]:
-    """Return members of X and Y in pairs, without their delays."""
-    # A delay between the axes adds the same error to all commands: it cannot rank them.
-    axes = [machine.axes[axis].without_delay() for axis in ("x", "y")]
-    return _side_by_side(*(plant_set(axis, dt_s).members for axis in axes))
 
 
 def _side_by_side(x: Sequence[DiscretePlant], y: Sequence[DiscretePlant]) -> list[Pair]:

@@ -14,7 +14,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeVar
 
-__all__ = ["Discarding", "default_cache_dir", "kept", "replacing"]
+__all__ = ["Discarding", "default_cache_dir", "kept", "replacing", "result_name", "sync"]
 
 T = TypeVar("T")
 
@@ -66,6 +66,27 @@ def replacing(target: Path) -> Iterator[Path]:
     finally:
         if handle is not None:
             os.close(handle)
+
+
+def sync(path: Path) -> None:
+    """Wait until a file or the names in a folder are on the disk."""
+    if os.name == "nt" and path.is_dir():
+        return  # Windows opens no folders
+    # Windows syncs only what may be written to.
+    handle = os.open(path, os.O_RDWR if os.name == "nt" else os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def result_name(name: str) -> str:
+    """Return what the result of a file is called: ``part.stillpath.gcode``.
+
+    Printers tell a sliced package by both of its suffixes.
+    """
+    suffix = ".gcode.3mf" if name.lower().endswith(".gcode.3mf") else Path(name).suffix
+    return f"{name[: len(name) - len(suffix)]}.stillpath{suffix or '.gcode'}"
 
 
 def _named(target: Path) -> Path:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -22,30 +23,29 @@ from stillpath.models.machine import Machine
 from stillpath.models.plants import plant_set
 from stillpath.models.reference_motion import reference_motion_of
 from stillpath.pipeline.caution import (
+    Mixtures,
+    Shares,
+    best_shares,
     error_ranges,
     measured_set,
-    member_pairs,
     most_share,
-    pair_weights,
+    nominal_response,
 )
 from stillpath.pipeline.files import kept
 from stillpath.pipeline.measuring.reference_shaper import BestShaper, cached_shaper
 from stillpath.pipeline.result import Channel
-from stillpath.simulation.measures import PathDistances
-from stillpath.simulation.response import response
 
 __all__ = ["LiveDesign", "cached_live_design", "design_live", "live_filter"]
 
 Array = NDArray[np.float64]
 
 DT_S = 1e-3
-_VERSION = 3
+_VERSION = 4
 """Part of the cache's name; rises when the design changes."""
 _CORNERS_HZ = (70.0, 90.0, 115.0, 150.0, 200.0, 270.0)
 _REACHES = (80, 160)
 """Samples on either side; the longer one serves axes with a mode below about 25 Hz."""
-_SHARES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.2, 0.0)
-_STRIDE, _NOTHING = 5, 1e-12
+_NOTHING = 1e-12
 _AS_GOOD, _AS_SHARP = 1.05, 1.02
 """Ratios to the least error. The shortest filter within the first is chosen, and of that length the
 one of least bandwidth within the second, which needs less acceleration."""
@@ -73,7 +73,7 @@ class LiveDesign:
     """
 
     taps: Array
-    shares: tuple[float, float]
+    shares: Shares
     corner_hz: float
     shaper: BestShaper
     worst: float
@@ -162,7 +162,7 @@ class _Candidate:
     ratio: float
     corner_hz: float
     taps: Array
-    shares: tuple[float, float]
+    shares: Shares
 
 
 class _Trial:
@@ -173,14 +173,9 @@ class _Trial:
         path, extruding = reference_motion_of(machine, DT_S)
         centre = [sum((machine.travel[a].min_mm, machine.travel[a].max_mm)) / 2 for a in ("x", "y")]
         self._path = path + np.array(centre)[:, None]
-        self._at = np.flatnonzero(extruding).astype(np.int64)[::_STRIDE]
-        self._distances = PathDistances(self._path, DT_S)
-        self._pairs = member_pairs(machine, DT_S)
-        self._weights = pair_weights(machine, len(self._pairs))
         self._smooth_taps = np.stack([shaper_taps(p, DT_S, _REACHES[-1]) for p in shaper.pulses])
         self._smooth = self._command(self._smooth_taps)
-        self._smooth_mm = self._answers(self._smooth)
-        self._shaped = np.array([self._rms(y) for y in self._smooth_mm])
+        self._mixtures = Mixtures(machine, self._path, extruding, self._smooth, DT_S)
 
     def chosen(self) -> LiveDesign:
         """Return the best candidate (see the module's description)."""
@@ -192,15 +187,16 @@ class _Trial:
         accurate = [one for one in short if one.ratio <= _AS_SHARP * least]
         best = min(accurate, key=lambda one: (one.corner_hz, one.ratio))
         command = self._command(best.taps)
-        errors = np.array([self._rms(y) for y in self._answers(command)])
+        mixtures = self._mixtures
+        ratio = mixtures.errors_mm(mixtures.answers(command)) / mixtures.shaped_mm
         channels = {"before": self._path, "live": command, "shaper": self._smooth}
         return LiveDesign(
             best.taps,
             best.shares,
             best.corner_hz,
             self._shaper,
-            float((errors / self._shaped).max()),
-            float(np.exp(self._weights @ np.log(errors / self._shaped))),
+            float(ratio.max()),
+            mixtures.mean(ratio),
             self._figures(channels),
             _peak(command),
         )
@@ -215,56 +211,33 @@ class _Trial:
             command = self._command(exact)
             if _peak(command) > self._machine.command.accel_mm_s2:
                 continue
-            exact_mm = self._answers(command)
-            ratios: dict[tuple[float, float], float] = {}
-            for share in _SHARES:
-                both = (min(share, most_shares[0]), min(share, most_shares[1]))
-                ratios[both] = self._ratio(exact_mm, both)
-            for axis in (0, 1):
-                best = min(ratios, key=ratios.__getitem__)
-                for share in _SHARES:
-                    one = (share, best[1]) if axis == 0 else (best[0], share)
-                    if share <= most_shares[axis] and one not in ratios:
-                        ratios[one] = self._ratio(exact_mm, one)
-            shares = min(ratios, key=ratios.__getitem__)
-            if shares != (0.0, 0.0) and np.isfinite(ratios[shares]):
-                yield _Candidate(ratios[shares], corner_hz, self._mixed(exact, shares), shares)
+            cost = cache(partial(self._ratio, self._mixtures.answers(command)))
+            shares = best_shares(cost, most_shares)
+            if shares != (0.0, 0.0) and np.isfinite(cost(shares)):
+                yield _Candidate(cost(shares), corner_hz, self._mixed(exact, shares), shares)
 
-    def _mixed(self, exact: Array, shares: tuple[float, float]) -> Array:
+    def _mixed(self, exact: Array, shares: Shares) -> Array:
         """Return the taps mixed with the shaper's."""
         a = np.array(shares)[:, None]
         padding = (self._smooth_taps.shape[1] - exact.shape[1]) // 2
         exact = np.pad(exact, ((0, 0), (padding, padding)))
         return _shortened(a * exact + (1.0 - a) * self._smooth_taps)
 
-    def _ratio(self, exact_mm: list[Array], shares: tuple[float, float]) -> float:
+    def _ratio(self, exact_mm: list[Array], shares: Shares) -> float:
         """Return the mean error relative to the shaper; infinite if any member is worse."""
-        a = np.array(shares)[:, None]
-        ours = np.array(
-            [
-                self._rms(a * exact + (1.0 - a) * smooth)
-                for exact, smooth in zip(exact_mm, self._smooth_mm, strict=True)
-            ]
-        )
-        ratio = ours / np.maximum(self._shaped, 1e-12)
-        return float(np.exp(self._weights @ np.log(ratio))) if ratio.max() <= 1.0 else np.inf
+        ratio = self._mixtures.errors_mm(exact_mm, shares) / self._mixtures.shaped_mm
+        return self._mixtures.mean(ratio) if ratio.max() <= 1.0 else np.inf
 
     def _command(self, taps: Array) -> Array:
         live = live_filter(self._machine, taps)
         return live.command(np.pad(self._path, ((0, 0), (live.margin, live.margin)), mode="edge"))
 
-    def _answers(self, command: Array) -> list[Array]:
-        return [response(pair, command)[:, self._at] for pair in self._pairs]
-
-    def _rms(self, points: Array) -> float:
-        return float(np.sqrt(np.mean(self._distances.at(points, self._at) ** 2)))
-
     def _figures(self, channels: dict[str, Array]) -> dict[str, tuple[float, float, float]]:
-        plants = [plant_set(self._machine.axes[a], DT_S).nominal for a in ("x", "y")]
-        spread = error_ranges(self._machine, channels, lambda y: self._rms(y[:, self._at]), DT_S)
+        spread = error_ranges(self._machine, channels, self._mixtures.rms_mm, DT_S)
         out = {}
         for name, command in channels.items():
-            usual = 1e3 * self._rms(response(plants, command)[:, self._at])
+            motion_mm = nominal_response(self._machine, command, DT_S)
+            usual = 1e3 * self._mixtures.rms_mm(motion_mm)
             out[name] = (usual, usual * spread[name][0], usual * spread[name][1])
         return out
 

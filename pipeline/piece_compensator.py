@@ -223,9 +223,8 @@ class PieceCompensator:
         row = timeline.row[np.minimum(at, len(timeline.row) - 1)]
         self._check_travel(encoded.position[:, :2].T / 1e6, row, piece)
         made = CompensatedPiece(timeline, command, extruding, segments, encoded, step_mm, bend_mm)
-        if (
-            reason := strayed(deviation(made, encoded.phases), extruding, self._follow_mm)
-        ) is not None:
+        reason = strayed(deviation(made, encoded.phases), extruding, self._follow_mm)
+        if reason is not None:
             raise _Sudden(f"planned by the firmware's rules, {reason}")
         return made
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import re
 import subprocess
@@ -14,6 +13,8 @@ from urllib.parse import urlsplit
 
 import pytest
 import yaml
+
+from tests.loading import module_at
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -45,11 +46,7 @@ def in_nav(entries: Any) -> Iterator[str]:
 
 
 def made_pages() -> set[str]:
-    spec = importlib.util.spec_from_file_location("site_pages", DOCS / "site_pages.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    module = module_at(DOCS / "site_pages.py", "site_pages")
     return {name for name in module.GENERATED if name.endswith(".md")} | TAKEN_OVER
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import subprocess
 import sys
@@ -11,6 +10,8 @@ from types import ModuleType
 
 import pytest
 
+from tests.loading import module_at
+
 ROOT = Path(__file__).parents[1]
 SCRIPT = ROOT / "benchmarks" / "page.py"
 RESULTS = sorted((ROOT / "benchmarks" / "results").glob("*.json"))
@@ -18,13 +19,7 @@ RESULTS = sorted((ROOT / "benchmarks" / "results").glob("*.json"))
 
 @pytest.fixture(scope="module")
 def page() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("benchmarks_page", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    return module
+    return module_at(SCRIPT, "benchmarks_page")
 
 
 def test_the_pages_are_what_the_results_make():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict
+from stillpath.models.document import Document
 
 __all__ = [
     "ControllerReport",
@@ -19,18 +19,14 @@ __all__ = [
 ]
 
 
-class _Figures(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class ExtremeFigure(_Figures):
+class ExtremeFigure(Document):
     """The extreme of a curve and where it lies."""
 
     db: float
     at_hz: float
 
 
-class SensitivityCurves(_Figures):
+class SensitivityCurves(Document):
     """Magnitudes over frequency, thinned so that no extreme is lost.
 
     `s0`, `s`: sensitivity without and with the add-on; `add_on`: |1 - PQ|; `inverse_t`: 1/|T|,
@@ -45,14 +41,14 @@ class SensitivityCurves(_Figures):
     q: tuple[float, ...]
 
 
-class Envelope(_Figures):
+class Envelope(Document):
     """A signal, thinned to the least and the largest value of every stretch."""
 
     t_s: tuple[float, ...]
     values: tuple[float, ...]
 
 
-class ResponseFigures(_Figures):
+class ResponseFigures(Document):
     """The machine's output under its disturbance; rms and largest value of the last quarter."""
 
     rms: float
@@ -61,7 +57,7 @@ class ResponseFigures(_Figures):
     end: Envelope
 
 
-class MemberFigures(_Figures):
+class MemberFigures(Document):
     """A member of the plant set: rms of the last quarter, and its spectral radius with add-on."""
 
     name: str
@@ -70,7 +66,7 @@ class MemberFigures(_Figures):
     spectral_radius: float | None
 
 
-class PredictorFigures(_Figures):
+class PredictorFigures(Document):
     """The last samples of the disturbance, what the slow sensor holds of it, and the prediction."""
 
     t_s: tuple[float, ...]
@@ -80,7 +76,7 @@ class PredictorFigures(_Figures):
     error_rms: float
 
 
-class TimeFigures(_Figures):
+class TimeFigures(Document):
     """Simulation of the nominal loop, without noise."""
 
     disturbance: str
@@ -92,7 +88,7 @@ class TimeFigures(_Figures):
     predictor: PredictorFigures | None = None
 
 
-class ControllerReport(_Figures):
+class ControllerReport(Document):
     """All figures of a designed controller; same machine, options and version give the same.
 
     `controller` is what is loaded: `Controller.to_dict`, with the machine and the options it was
@@ -118,7 +114,7 @@ class ControllerReport(_Figures):
     controller: dict[str, Any]
 
 
-class LoopFigures(_Figures):
+class LoopFigures(Document):
     """A closed-loop machine and the methods that fit it."""
 
     name: str

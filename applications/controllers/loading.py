@@ -14,6 +14,7 @@ from stillpath.applications.controllers.response import settling_ticks
 from stillpath.compensation.base import DesignError
 from stillpath.models.complaints import complaint
 from stillpath.models.diagrams import Block, Diagram
+from stillpath.models.document import Document
 from stillpath.models.loops import LoopSpec
 
 __all__ = ["LoadedController", "load_controller", "read_controller"]
@@ -80,9 +81,7 @@ def read_controller(document: str | bytes, source: str = "controller") -> Loaded
     return LoadedController(found.method, found.loop, found.options, blocks, found.every, settling)
 
 
-class _Equation(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
+class _Equation(Document):
     output: Annotated[str, Field(max_length=64)]
     inputs: Annotated[tuple[tuple[str, Finite], ...], Field(min_length=1, max_length=16)]
     num: Polynomial

@@ -9,11 +9,12 @@ import re
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import Field, TypeAdapter, ValidationError
 
 from stillpath.compensation.base import DesignError
 from stillpath.models.complaints import complaint
 from stillpath.models.disturbances import Narrowband, Periodic, Switched, Wideband
+from stillpath.models.document import Document
 from stillpath.models.loops import LoopSpec, load_loop
 
 __all__ = [
@@ -43,7 +44,7 @@ LoopReference = LoopName | LoopSpec
 """A built-in closed-loop machine, or a whole one as a document; never a path."""
 
 
-class _Options(BaseModel):
+class _Options(Document):
     """What all methods share.
 
     Attributes
@@ -60,8 +61,6 @@ class _Options(BaseModel):
     duration_s : float, optional
         Of the time response; left out, until the slowest transient is gone.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     loop: LoopSpec | None = None
     uncertainty: Annotated[float, Field(gt=0, le=10, allow_inf_nan=False)] | None = None

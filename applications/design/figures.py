@@ -7,8 +7,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict
-
+from stillpath.models.document import Document
 from stillpath.pipeline.options import BasisName, RobustMode
 
 __all__ = [
@@ -27,18 +26,14 @@ __all__ = [
 ]
 
 
-class _Figures(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class ModeFigures(_Figures):
+class ModeFigures(Document):
     """A resonance."""
 
     f_hz: float
     zeta: float
 
 
-class ZeroFigures(_Figures):
+class ZeroFigures(Document):
     """A zero of the sampled plant outside the unit circle; `f_hz` belongs to its angle."""
 
     real: float
@@ -47,7 +42,7 @@ class ZeroFigures(_Figures):
     f_hz: float
 
 
-class Member(_Figures):
+class Member(Document):
     """One plant of the axis' set; weights sum to 1 over the members."""
 
     modes: tuple[ModeFigures, ...]
@@ -56,7 +51,7 @@ class Member(_Figures):
     """Its weight with `robust` minimax, None without a set."""
 
 
-class AxisFigures(_Figures):
+class AxisFigures(Document):
     """The plant of the axis and its set, sampled.
 
     `settling_s` is the time in which the slowest pole decays to 1 %.
@@ -70,7 +65,7 @@ class AxisFigures(_Figures):
     notes: tuple[str, ...]
 
 
-class Frequencies(_Figures):
+class Frequencies(Document):
     """Frequency response of the axis: its nominal plant, and the range of its set.
 
     Gains in mm/mm, phases in degrees, unwrapped from the lowest frequency on; without a set
@@ -89,7 +84,7 @@ class Frequencies(_Figures):
     """Whether a measurement told the phase, or only the structure of the model does."""
 
 
-class LiftedFigures(_Figures):
+class LiftedFigures(Document):
     """Singular values, falling, of the plants the design looks at, lifted over the window.
 
     `position` in mm/mm; `increments`, with two integrators in front, in mm per mm/sample^2.
@@ -100,7 +95,7 @@ class LiftedFigures(_Figures):
     increments: tuple[float, ...]
 
 
-class RobustMetric(_Figures):
+class RobustMetric(Document):
     """J_e,r of the n = 1, 2, .. most robust functions and its parts, whose squares add up (4.9).
 
     `best` functions are best by remark 4.5; `left_out` directions are answered by less than 1e-7
@@ -117,7 +112,7 @@ class RobustMetric(_Figures):
     uncertainty_part: tuple[float, ...]
 
 
-class Metrics(_Figures):
+class Metrics(Document):
     """Closed forms for n = 1, 2, .. functions and white paths.
 
     `error` is J_e (2.26). Efforts are J_c of CE-Opt functions (3.23): of a position command in
@@ -131,7 +126,7 @@ class Metrics(_Figures):
     """Empty for an axis without a set."""
 
 
-class RungFigures(_Figures):
+class RungFigures(Document):
     """A design of the ladder: accepted with its figures, or refused with the reason.
 
     `error` and `robust_error` are J_e on the nominal plant and J_e,r over the set (None without
@@ -149,7 +144,7 @@ class RungFigures(_Figures):
     effort: float | None = None
 
 
-class Curve(_Figures):
+class Curve(Document):
     """One way to drive the machine along the reference motion.
 
     Contour errors, rms while extruding, in um; accelerations of this axis' command in mm/s^2.
@@ -171,7 +166,7 @@ class Curve(_Figures):
     rms_accel_mm_s2: float
 
 
-class Robustness(_Figures):
+class Robustness(Document):
     """What every command leaves when the axis' frequencies are off by so many percent.
 
     `errors_percent` is empty for a plant whose frequencies cannot be scaled.
@@ -183,7 +178,7 @@ class Robustness(_Figures):
     """Commands that could not be designed, and why."""
 
 
-class DesignReport(_Figures):
+class DesignReport(Document):
     """All figures of `design_report`; the same machine, settings and version give the same."""
 
     version: str

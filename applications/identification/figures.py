@@ -7,9 +7,8 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict
-
 from stillpath.applications.machines.frequency import ModelCurve
+from stillpath.models.document import Document
 from stillpath.models.provenance import MeasuredMode, SourceFile
 
 __all__ = [
@@ -23,11 +22,7 @@ __all__ = [
 ]
 
 
-class _Figures(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class ResponseFigures(_Figures):
+class ResponseFigures(Document):
     """A measured response, the sensor's gain and delay taken out; None: not usable there.
 
     `residual` is |measured / model - 1|.
@@ -41,7 +36,7 @@ class ResponseFigures(_Figures):
     residual: tuple[float | None, ...]
 
 
-class SpectrumFigures(_Figures):
+class SpectrumFigures(Document):
     """A measured power spectral density and what the model says it should be, (mm/s^2)^2/Hz."""
 
     label: str
@@ -50,14 +45,14 @@ class SpectrumFigures(_Figures):
     predicted: tuple[float, ...]
 
 
-class TrialFigures(_Figures):
+class TrialFigures(Document):
     """What so many pole pairs reached."""
 
     order: int
     residual: float
 
 
-class ShaperFigures(_Figures):
+class ShaperFigures(Document):
     """What a firmware shaper would do on this axis, by Klipper's own rules."""
 
     name: str
@@ -68,7 +63,7 @@ class ShaperFigures(_Figures):
     recommended: bool
 
 
-class AxisFigures(_Figures):
+class AxisFigures(Document):
     """One axis.
 
     Attributes
@@ -99,7 +94,7 @@ class AxisFigures(_Figures):
     warnings: tuple[str, ...]
 
 
-class IdentificationReport(_Figures):
+class IdentificationReport(Document):
     """Everything that was found, for one machine."""
 
     version: str

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from stillpath.applications.machines.resonances import resonances
+from stillpath.models.document import Document
 from stillpath.models.machine import Machine
 from stillpath.models.plants import PlantSetSpec, PlantSpec, frequency_response
 from stillpath.models.provenance import MeasuredMode
@@ -21,10 +22,8 @@ _DIGITS = 5
 _FIRST_HZ, _LEAST_HZ, _BEYOND = 1.0, 100.0, 1.25
 
 
-class ModelCurve(BaseModel):
+class ModelCurve(Document):
     """A model over frequency: modulus, and phase in degrees."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     f_hz: tuple[float, ...]
     magnitude: tuple[float, ...]

@@ -8,6 +8,8 @@ import tempfile
 import time
 from pathlib import Path
 
+from stillpath.pipeline.files import sync
+
 __all__ = ["publish", "sync_folder"]
 
 _ABANDONED_S = 3600.0
@@ -42,12 +44,8 @@ def publish(target: Path, text: str) -> None:
 
 def sync_folder(folder: Path) -> None:
     """Bring the names in a folder to disk, where the system can."""
-    with contextlib.suppress(OSError):  # Windows opens no folders
-        handle = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)
+    with contextlib.suppress(OSError):
+        sync(folder)
 
 
 def _take_name(temporary: Path, target: Path) -> None:

@@ -6,11 +6,12 @@ import os
 from datetime import UTC, datetime
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import ValidationError
 
 from stillpath.applications.machines.checks import age_warnings
 from stillpath.applications.machines.revision import NotApproved, UnknownMachine, document_text
 from stillpath.applications.machines.store import MachineStore
+from stillpath.models.document import Document
 from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
 from stillpath.models.store import (
@@ -24,7 +25,7 @@ from stillpath.models.store import (
 __all__ = ["PinnedMachine", "Resolver"]
 
 
-class PinnedMachine(BaseModel):
+class PinnedMachine(Document):
     """A machine as it was found; a job keeps the one that it was accepted with.
 
     Attributes
@@ -34,8 +35,6 @@ class PinnedMachine(BaseModel):
     warnings : tuple of str
         What speaks against using it; goes into the report of the job.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     machine: Machine
     number: int | None = None

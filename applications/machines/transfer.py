@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import ValidationError
 from pydantic_core import from_json
 
 from stillpath.applications.machines.checks import with_firmware
@@ -17,6 +17,7 @@ from stillpath.applications.machines.revision import (
     source_file,
 )
 from stillpath.applications.machines.store import MachineStore
+from stillpath.models.document import Document
 from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
 from stillpath.models.provenance import SourceFile
@@ -28,13 +29,11 @@ __all__ = ["export_history", "import_file", "with_firmware_file"]
 _LARGEST_BYTES = 64_000_000
 
 
-class _History(BaseModel):
+class _History(Document):
     """A machine with all its revisions.
 
     Approvals are there to be read: they do not hold in another store.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     format: Literal["stillpath machine history"] = "stillpath machine history"
     name: str

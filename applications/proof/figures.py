@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict
+from stillpath.models.document import Document
 
 __all__ = ["AxisReadback", "Corners", "Curve", "ReadbackReport"]
 
 
-class _Figures(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-
-
-class Curve(_Figures):
+class Curve(Document):
     """A curve of the page."""
 
     x: list[float]
@@ -20,7 +16,7 @@ class Curve(_Figures):
     fitted: list[float]
 
 
-class Corners(_Figures):
+class Corners(Document):
     """Vibration near the mode, 20 to 120 ms after the command has slowed down: rms."""
 
     count: int
@@ -30,7 +26,7 @@ class Corners(_Figures):
     predicted_um: float
 
 
-class AxisReadback(_Figures):
+class AxisReadback(Document):
     """One axis.
 
     `nrmse` is the rms of measured minus predicted acceleration over that of the measured one, 5 to
@@ -55,7 +51,7 @@ class AxisReadback(_Figures):
     holds: bool
 
 
-class ReadbackReport(_Figures):
+class ReadbackReport(Document):
     """What `stillpath verify` found. `outcome`: the model holds, has changed, or another print."""
 
     version: str

@@ -4,20 +4,15 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict
-
 from stillpath.models.confirmation import Confirmation
+from stillpath.models.document import Document
 
 __all__ = ["AxisRing", "Half", "RingReport", "Verdict"]
 
 Verdict = Literal["confirmed", "not confirmed", "says nothing"]
 
 
-class _Figures(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-
-
-class Half(_Figures):
+class Half(Document):
     """Vibration after the stops of one half of an axis: rms over stops, in the band of the modes.
 
     `scatter_um` is the standard error, from repeats of the same stops; the noise floor is taken off
@@ -32,7 +27,7 @@ class Half(_Figures):
     predicted_um: tuple[float, float]
 
 
-class AxisRing(_Figures):
+class AxisRing(Document):
     """One axis. Figures are None where its logs say nothing at all.
 
     `misses` is how much of the motion the plant of the set that does best misses, 0 to 1, gain and
@@ -44,7 +39,7 @@ class AxisRing(_Figures):
     verdict: Verdict
     text: str
     band_hz: tuple[float, float]
-    logs: list[str] = []
+    logs: tuple[str, ...] = ()
     seen: int = 0
     within: int = 0
     gain: float | None = None
@@ -56,7 +51,7 @@ class AxisRing(_Figures):
     confirmation: Confirmation | None = None
 
 
-class RingReport(_Figures):
+class RingReport(Document):
     """What `stillpath verify` found of a ring test."""
 
     version: str

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict
+from stillpath.models.document import Document
 
 __all__ = ["ScanReport", "TrackFigures", "VariantFigures"]
 
 
-class _Figures(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class TrackFigures(_Figures):
+class TrackFigures(Document):
     """One track: where it lies in the file and on the work, and its errors by variant, in um."""
 
     line: int
@@ -24,7 +20,7 @@ class TrackFigures(_Figures):
     across_um: dict[str, float]
 
 
-class VariantFigures(_Figures):
+class VariantFigures(Document):
     """One way to drive the scanner, over all samples of all tracks.
 
     `across_um`: rms of the error across the tracks.
@@ -37,7 +33,7 @@ class VariantFigures(_Figures):
     across_um: float
 
 
-class ScanReport(_Figures):
+class ScanReport(Document):
     """What a scan leaves; the variants from as sent to the best there is."""
 
     version: str

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from stillpath.models.errors import ModelError
+from stillpath.pipeline.files import result_name
 
 __all__ = [
     "Group",
@@ -17,7 +18,6 @@ __all__ = [
     "is_stamped",
     "items_of",
     "parse_map",
-    "result_name",
 ]
 
 _SUFFIXES = (".gcode", ".gco", ".g", ".nc", ".bgcode", ".bgc", ".3mf")
@@ -168,16 +168,6 @@ def is_stamped(path: Path) -> bool:
     except (GcodeError, OSError):
         return False
     return False
-
-
-def result_name(name: str) -> str:
-    """Return what the result of a file is called: ``part.stillpath.gcode``.
-
-    Printers tell a sliced package by both of its suffixes.
-    """
-    path = Path(name)
-    suffix = ".gcode.3mf" if name.lower().endswith(".gcode.3mf") else path.suffix
-    return f"{name[: len(name) - len(suffix)]}.stillpath{suffix or '.gcode'}"
 
 
 def _names(text: str) -> tuple[str, ...]:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import errno
 import hashlib
-import os
 import shutil
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -18,7 +17,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from stillpath.pipeline.files import replacing
+from stillpath.pipeline.files import replacing, sync
 from stillpath.service.instance_lock import exclusive
 
 __all__ = ["Figures", "Outcome", "OutputFolder", "Scratch", "State", "Trouble", "sha256_of"]
@@ -148,7 +147,7 @@ class OutputFolder:
             EEXIST if a file that we did not write is in its place; it stays.
         """
         self._check_place(outcome)
-        _sync(scratch.result)
+        sync(scratch.result)
         _write(scratch.folder / _RECORD, outcome)
         self._place(scratch.folder, outcome)
 
@@ -178,9 +177,9 @@ class OutputFolder:
             target = self.root / outcome.output
             target.parent.mkdir(parents=True, exist_ok=True)
             scratch.result.replace(target)
-            _sync(target.parent)
+            sync(target.parent)
         (folder / _RECORD).replace(self._record(outcome.output))
-        _sync(self._records)
+        sync(self._records)
         shutil.rmtree(folder)
 
     def _check_place(self, outcome: Outcome) -> None:
@@ -235,17 +234,6 @@ def _read(path: Path) -> Outcome | None:
 def _write(path: Path, outcome: Outcome) -> None:
     with replacing(path) as temporary:
         temporary.write_text(outcome.model_dump_json(indent=1), encoding="utf-8")
-
-
-def _sync(path: Path) -> None:
-    """Bring a file, or where the system can do so the entries of a folder, to the disk."""
-    if path.is_dir() and os.name == "nt":
-        return
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 def _short(output: str) -> str:

@@ -93,17 +93,14 @@ class Prefilter:
 def design_prefilter(
     loop: Loop,
     *,
-    kind: str = "zpetc",
     cutoff_hz: float | None = None,
     length: int = _PREVIEW,
 ) -> Prefilter:
-    """Invert the loop's response to its reference.
+    """Invert the loop's response to its reference, by ZPETC.
 
     Parameters
     ----------
     loop : Loop
-    kind : str
-        See `compensation.inversion.invert`.
     cutoff_hz : float, optional
         Of the zero-phase FIR; None: no FIR (see `fir_within`).
     length : int
@@ -117,7 +114,7 @@ def design_prefilter(
     if length < 1:
         raise DesignError(f"low-pass that looks {length} samples ahead; at least 1 is needed")
     # A reference has physical units: the inverse must have exact DC gain.
-    inversion = invert(kind, reference_plant(loop), order=0, unit_dc=True)
+    inversion = invert("zpetc", reference_plant(loop), order=0, unit_dc=True)
     fir = None if cutoff_hz is None else zero_phase_fir(cutoff_hz, loop.dt_s, length)
     return Prefilter(inversion, fir, loop.dt_s)
 

@@ -23,7 +23,6 @@ def sanathanan_koerner(
     numerator: int,
     denominator: int,
     *,
-    unit_gain: bool = False,
     rounds: int = 15,
 ) -> tuple[Array, Array, float]:
     """Fit B/A with A = 1 + a_1 x + ... + a_n x^n.
@@ -35,8 +34,6 @@ def sanathanan_koerner(
     response, weight : ndarray, shape (points,)
     numerator, denominator : int
         Degrees of B and A.
-    unit_gain : bool
-        Fix b_0 = a_0: the value at x = 0 is 1.
 
     Returns
     -------
@@ -46,16 +43,15 @@ def sanathanan_koerner(
         Root of sum |weight (B/A - H)|^2 over sum |weight H|^2.
     """
     top, bottom = basis[:, : numerator + 1], basis[:, : denominator + 1]
-    first = 1 if unit_gain else 0
-    matrix = np.hstack([top[:, first:], -response[:, None] * bottom[:, 1:]])
-    right = response - unit_gain
+    matrix = np.hstack([top, -response[:, None] * bottom[:, 1:]])
     size = float(np.linalg.norm(weight * response))
     scale = weight.copy()
     best: tuple[Array, Array, float] | None = None
     for _ in range(rounds):
-        solution = _least_squares(matrix * scale[:, None], right * scale)
-        b = np.concatenate([np.ones(first), solution[: numerator + 1 - first]])
-        a = np.concatenate([[1.0], solution[numerator + 1 - first :]])
+        b, rest = np.split(
+            _least_squares(matrix * scale[:, None], response * scale), [numerator + 1]
+        )
+        a = np.concatenate([[1.0], rest])
         denominators = bottom @ a
         fitted = (top @ b) / denominators
         error = float(np.linalg.norm(weight * (fitted - response))) / size

@@ -164,7 +164,7 @@ class _Job:
             self._machine, DT_S, self._shaper, ("after",), take_layer=take_layer, **measuring
         )
         with self._clock.stage("measure"):
-            written = self._go(self._spool, [advised], "measuring", (0.8, 1.0), lambda _: None)
+            written = self._go(self._spool, [advised], "measuring", (0.8, 1.0))
         if layers is not None:
             layers.finish(names)
         self._say("done", 1.0)
@@ -232,7 +232,7 @@ class _Job:
             writer = self._write(choice, first_layer)
             set_errors = SetErrors(self._machine, DT_S, stride=STRIDE)
             shares = 0.6 + 0.03 * attempt, 0.8
-            written = self._go(self._spool, [set_errors], "verifying", shares, lambda _: None)
+            written = self._go(self._spool, [set_errors], "verifying", shares)
             errors = set_errors.errors()
             over = {
                 f: errors[f].rms_um / self._bound_um(f, was)
@@ -274,7 +274,7 @@ class _Job:
         sinks: Sequence[Measurement | SetErrors],
         stage: str,
         shares: tuple[float, float],
-        each: Callable[[ProgramBlock], None],
+        each: Callable[[ProgramBlock], None] = lambda _: None,
     ) -> TextMotion:
         """Measure the motion of a text."""
         low, high = shares
@@ -411,21 +411,17 @@ def _add(
 def _merged(before: Sequence[GroupFigures], after: Sequence[GroupFigures]) -> list[GroupFigures]:
     """Put the figures of both files side by side."""
     known = {group.name: group for group in after}
-    out = []
-    for group in before:
-        other = known.get(group.name)
-        if other is None:
-            continue
-        out.append(
-            GroupFigures(
-                name=group.name,
-                title=group.title,
-                seconds=other.seconds,
-                contour_rms_um=_in_order(group.contour_rms_um | other.contour_rms_um),
-                contour_max_um=_in_order(group.contour_max_um | other.contour_max_um),
-            )
+    return [
+        GroupFigures(
+            name=group.name,
+            title=group.title,
+            seconds=other.seconds,
+            contour_rms_um=_in_order(group.contour_rms_um | other.contour_rms_um),
+            contour_max_um=_in_order(group.contour_max_um | other.contour_max_um),
         )
-    return out
+        for group in before
+        if (other := known.get(group.name)) is not None
+    ]
 
 
 def _in_order(values: dict[str, V]) -> dict[str, V]:
@@ -435,8 +431,9 @@ def _in_order(values: dict[str, V]) -> dict[str, V]:
 def _merged_spectra(
     before: Sequence[AxisSpectrum], after: Sequence[AxisSpectrum]
 ) -> list[AxisSpectrum]:
-    out = []
-    for one, other in zip(before, after, strict=False):
-        ordered = _in_order(one.um_per_sqrt_hz | other.um_per_sqrt_hz)
-        out.append(one.model_copy(update={"um_per_sqrt_hz": ordered}))
-    return out
+    return [
+        one.model_copy(
+            update={"um_per_sqrt_hz": _in_order(one.um_per_sqrt_hz | other.um_per_sqrt_hz)}
+        )
+        for one, other in zip(before, after, strict=False)
+    ]

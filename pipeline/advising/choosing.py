@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 
 import numpy as np
 
@@ -29,7 +30,7 @@ from stillpath.pipeline.advising.advice import (
     wanted_accel,
 )
 from stillpath.pipeline.advising.trials import Trial
-from stillpath.pipeline.measuring.reference_shaper import FREQUENCIES_HZ
+from stillpath.pipeline.measuring.reference_shaper import FREQUENCIES_HZ, descend
 from stillpath.pipeline.measuring.set_errors import machine_numbers
 from stillpath.pipeline.pacing.samples import FileSamples
 from stillpath.pipeline.piece_compensator import DT_S
@@ -45,6 +46,10 @@ _AIM = 0.95
 _POINTS, _MEMBERS = 1000, 5
 """Points and members used to tune frequencies; the final choice uses all members."""
 _COARSE = 6
+_TOGETHER = [(-3, -3), (-1, -1), (1, 1), (3, 3)]
+_EITHER = [*((k, 0) for k in (-3, -1, 1, 3)), *((0, k) for k in (-3, -1, 1, 3))]
+_EITHER += [(-2, -2), (-2, 2), (2, -2), (2, 2)]
+"""Steps of the frequencies of X and Y, if they must be the same and if not."""
 _TUNED_LEVELS = 5
 _MENDING_ROUNDS = 4
 _UNLIKE = 2.0
@@ -380,45 +385,26 @@ def _tuned(
     same: bool,
 ) -> tuple[int, int]:
     """Return the frequency indices of X and Y that minimise the worst member's error."""
-    answers: dict[tuple[int, int, int], np.ndarray] = {}
-    known: dict[tuple[int, int], float] = {}
-    top = len(FREQUENCIES_HZ) - 1
 
+    @cache
     def answer(member: int, axis: int, number: int) -> np.ndarray:
-        key = (member, axis, number)
-        if key not in answers:
-            f_hz = float(FREQUENCIES_HZ[number])
-            answers[key] = trial.axis_answer(member, axis, kind, f_hz, at)
-        return answers[key]
+        return trial.axis_answer(member, axis, kind, float(FREQUENCIES_HZ[number]), at)
 
+    @cache
     def rms(i: int, j: int) -> float:
-        if (i, j) not in known:
-            motions = [(answer(k, 0, i), answer(k, 1, j)) for k in range(members)]
-            known[i, j] = trial.rms(motions, at)
-        return known[i, j]
+        return trial.rms([(answer(k, 0, i), answer(k, 1, j)) for k in range(members)], at)
 
-    coarse = range(0, top + 1, _COARSE)
+    coarse = range(0, len(FREQUENCIES_HZ), _COARSE)
     if start is not None:
         i, j = int(start[0]), int(start[1])
     elif same:
         i = j = min(coarse, key=lambda k: rms(k, k))
     else:
-        i = j = top // 2
+        i = j = (len(FREQUENCIES_HZ) - 1) // 2
         for _ in range(2):
             i = min(coarse, key=lambda k: rms(k, j))
             j = min(coarse, key=lambda k: rms(i, k))
-    while True:
-        steps = [-3, -1, 1, 3]
-        if same:
-            around = [(i + a, i + a) for a in steps]
-        else:
-            around = [(i + a, j) for a in steps] + [(i, j + a) for a in steps]
-            around += [(i + a, j + b) for a in (-2, 2) for b in (-2, 2)]
-        around = [(a, b) for a, b in around if 0 <= a <= top and 0 <= b <= top]
-        a, b = min(around, key=lambda pair: (rms(*pair), pair))
-        if rms(a, b) >= rms(i, j):
-            return i, j
-        i, j = a, b
+    return descend(rms, (i, j), _TOGETHER if same else _EITHER)
 
 
 def _by_point(

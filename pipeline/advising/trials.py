@@ -21,7 +21,7 @@ from stillpath.models.machine import Machine
 from stillpath.models.schedule import OperatingPoint
 from stillpath.models.shaping import AxisShaper, Shaping
 from stillpath.pipeline.advising.advice import Advice, Bound, wanted_accel
-from stillpath.pipeline.measuring.reference_shaper import shaped_at
+from stillpath.pipeline.measuring.reference_shaper import shaped_at, spread
 from stillpath.pipeline.pacing.samples import FileSamples, Sample
 from stillpath.simulation.measures import PathDistances
 from stillpath.simulation.scheduled import MachineStream
@@ -86,14 +86,16 @@ class Trial:
         advice = Advice(bounds, first_layer=samples.first_layer)
         motion = _motion(samples.samples, advice, machine, adviser, dt_s)
         self._dt_s = dt_s
-        self._path, self._feature = motion.path_mm, motion.feature
+        self._path = motion.path_mm
         self._bounds = [(a, b, p if point is None else point) for a, b, p in motion.bounds]
         self.seconds = motion.seconds
         self.total_s = sum(motion.seconds.values())
         self._distance = PathDistances(self._path, dt_s)
         self._answers = [self._answer(machine, member) for member in members]
         self._index = {
-            f: _chosen(self._feature, f) for f in np.unique(self._feature).tolist() if f >= -1
+            f: spread(np.flatnonzero(motion.feature == f).astype(np.int64), _POINTS)
+            for f in np.unique(motion.feature).tolist()
+            if f >= -1
         }
         every = [i for i in self._index.values() if len(i)]
         self._at = np.unique(np.concatenate(every)) if every else np.zeros(0, np.int64)
@@ -218,20 +220,9 @@ def _planned(sample: Sample, advice: Advice, machine: Machine, adviser: Adviser)
     changed = np.flatnonzero(~np.isnan(wanted) & (wanted != file))
     if not len(changed):
         return piece.phases
-    limits, limits_id = list(piece.limits), moves.limits_id.copy()
-    made: dict[tuple[int, float], int] = {}
-    for k in changed.tolist():
-        key = (int(moves.limits_id[k]), float(wanted[k]))
-        if key not in made:
-            made[key] = len(limits)
-            limits.append(adviser.with_accel(piece.limits[key[0]], key[1]))
-        limits_id[k] = made[key]
+    pairs = list(zip(moves.limits_id[changed].tolist(), wanted[changed].tolist(), strict=True))
+    numbers = {pair: len(piece.limits) + n for n, pair in enumerate(dict.fromkeys(pairs))}
+    limits = [*piece.limits, *(adviser.with_accel(piece.limits[k], a) for k, a in numbers)]
+    limits_id = moves.limits_id.copy()
+    limits_id[changed] = [numbers[pair] for pair in pairs]
     return plan_moves(replace(moves, limits_id=limits_id), limits, machine)
-
-
-def _chosen(feature: NDArray[np.int32], wanted: int) -> Ints:
-    """Choose samples of a feature, one per cell at random to avoid aliasing with the motion."""
-    rows = np.flatnonzero(feature == wanted)
-    step = max(1, len(rows) // _POINTS)
-    offset = np.random.default_rng(1).integers(0, step, len(rows) // step)
-    return np.asarray(rows[np.arange(len(offset)) * step + offset], np.int64)

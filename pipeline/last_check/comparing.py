@@ -237,7 +237,10 @@ class LastCheck:
         written.line += lines
         known = found == at.SAME and wanted.counts_filament(self._after.state)
         if taken and not known and wanted.code in self._original.perhaps:
-            self._take_earlier(wanted.code, carried_out=found == at.SAME)
+            is_next = found != at.SAME and written.data.startswith(wanted.code, written.at)
+            if is_next:
+                written.skip(written.data.index(b"\n", written.at) + 1)
+            self._take_earlier(wanted.code, carry_out=is_next)
             return
         if taken:
             if found != at.SAME:
@@ -290,11 +293,11 @@ class LastCheck:
 
     def _takes(self, code: bytes, *, held_back: bool) -> bool:
         """Match a line of a stream to one of the original; return whether there is one."""
-        wanted, perhaps = self._wanted, self._original.perhaps
+        wanted, in_doubt = self._wanted, code in self._original.perhaps
         if (
             wanted is not None
             and is_same(code, wanted.code)
-            and (code not in perhaps or self._stands_before(wanted))
+            and (not in_doubt or self._stands_before(wanted))
         ):
             compared = wanted.kind is Kind.RESTS and not held_back
             if compared:
@@ -308,17 +311,9 @@ class LastCheck:
                 self._check(self._before.state, wanted.mask | at.WITHIN, code, wanted.line)
             self._take(wanted, compared=compared)
             return True
-        if code in perhaps:
-            while perhaps.popleft() != code:
-                pass
-            if not held_back:
-                self._after.carry_out(code)
-            if wanted is not None and is_same(code, wanted.code):
-                self._earlier.append(wanted.code)
-                self._count_anew()
-            self._kept += 1
-            return True
-        return False
+        if in_doubt:
+            self._take_earlier(code, carry_out=not held_back)
+        return in_doubt
 
     def _stands_before(self, wanted: Wanted) -> bool:
         """Whether place and filament are the original's: an earlier line would do the same here."""
@@ -326,19 +321,18 @@ class LastCheck:
         found = at.compare(wanted.before, after, at.WITHIN, self._place_mm, self._filament_mm)
         return found == at.SAME and wanted.counts_filament(after)
 
-    def _take_earlier(self, code: bytes, *, carried_out: bool) -> None:
-        """Match a line to the first possible one with its text instead of the awaited one.
+    def _take_earlier(self, code: bytes, *, carry_out: bool) -> None:
+        """Match a line to the first possible one with its text, not to the awaited one.
 
-        Filament is counted anew from the next line that is compared.
+        If that has the same text, filament is counted anew from the next line that is compared.
         """
-        written, perhaps = self._written, self._original.perhaps
-        while perhaps.popleft() != code:
+        while self._original.perhaps.popleft() != code:
             pass
-        if not carried_out and written.data.startswith(code, written.at):
+        if carry_out:
             self._after.carry_out(code)
-            written.skip(written.data.index(b"\n", written.at) + 1)
-        self._count_anew()
-        self._earlier.append(code)
+        if self._wanted is not None and is_same(code, self._wanted.code):
+            self._earlier.append(self._wanted.code)
+            self._count_anew()
         self._kept += 1
 
     def _came_already(self) -> bool:

@@ -16,7 +16,7 @@ import hashlib
 import itertools
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -38,8 +38,10 @@ __all__ = [
     "FREQUENCIES_HZ",
     "BestShaper",
     "cached_shaper",
+    "descend",
     "evaluate_shaper",
     "shaped_at",
+    "spread",
     "tune_each",
     "tune_shaper",
     "tuning_digest",
@@ -54,6 +56,8 @@ _VERSION = 2
 _SHIPPED, _SHIPPED_US = Path(__file__).with_name("reference_shapers.json"), 1000
 _COARSE = 4
 _COARSE_POINTS, _FINE_POINTS, _FINAL_POINTS = 1500, 8000, 60_000
+_AROUND = [(a, b) for k in (1, 3) for a, b in itertools.product((-k, 0, k), (-k, 0, k))]
+"""Steps of the descent on the full grid."""
 _STARTS, _FINALISTS, _FINALISTS_EACH = 4, 6, 2
 _REST_S = 0.12
 """Longer than the longest shaper, 3hump_ei at 20 Hz: 0.1 s."""
@@ -105,7 +109,7 @@ def tune_shaper(
         finalists += [(value, kind, i, j) for value, i, j in _floors(trial, kind)]
         trial.forget()
     _, i, j, kind = min(
-        (*_descend(trial, kind, (i, j), trial.points(_FINAL_POINTS)), kind)
+        (*_descend(trial, kind, (i, j), _FINAL_POINTS), kind)
         for _, kind, i, j in sorted(finalists)[:_FINALISTS]
     )
     return evaluate_shaper(
@@ -125,7 +129,7 @@ def tune_each(
     best = {}
     for kind in kinds:
         _, i, j = min(
-            _descend(trial, kind, (i, j), trial.points(_FINAL_POINTS))
+            _descend(trial, kind, (i, j), _FINAL_POINTS)
             for _, i, j in sorted(_floors(trial, kind))[:_FINALISTS_EACH]
         )
         trial.forget()
@@ -238,30 +242,22 @@ class _Trial:
         self._dt_s = dt_s
         self._distances = PathDistances(self._y_d, dt_s)
         self._answer = response(_plants(machine, dt_s), self._y_d)
-        chosen = np.flatnonzero(use)
-        self._chosen = chosen.astype(np.int64)
+        self._chosen = np.flatnonzero(use).astype(np.int64)
         self._points: dict[int, Ints] = {}
-        """Samples at which the trial is measured, by their key."""
         self._shaped: dict[tuple[int, str, int, int], Array] = {}
         self._known: dict[tuple[int, str, int, int], float] = {}
 
-    def points(self, count: int) -> int:
-        """Prepare about `count` points spread over the extruding samples; return their key."""
-        if count not in self._points:
-            step = max(1, len(self._chosen) // count)
-            # One random sample per cell avoids aliasing with the motion.
-            offset = np.random.default_rng(1).integers(0, step, len(self._chosen) // step)
-            cells = np.arange(len(offset)) * step + offset
-            self._points[count] = self._chosen[cells]
-        return count
+    def rms(self, kind: str, i: int, j: int, count: int) -> float:
+        """Return the rms contour error [mm] with frequency index i on X and j on Y.
 
-    def rms(self, kind: str, i: int, j: int, points: int) -> float:
-        """Return the rms contour error [mm] with frequency index i on X and j on Y."""
-        key = (points, kind, i, j)
+        It is measured at about `count` points spread over the extruding samples.
+        """
+        if count not in self._points:
+            self._points[count] = spread(self._chosen, count)
+        key = (count, kind, i, j)
         if key not in self._known:
-            at = self._points[points]
-            y = np.stack([self._axis(0, kind, i, points), self._axis(1, kind, j, points)])
-            error = self._distances.at(y, at)
+            y = np.stack([self._axis(0, kind, i, count), self._axis(1, kind, j, count)])
+            error = self._distances.at(y, self._points[count])
             self._known[key] = float(np.sqrt(error @ error / len(error)))
         return self._known[key]
 
@@ -269,13 +265,20 @@ class _Trial:
         """Drop the shaped responses (they are large and of one shaper type)."""
         self._shaped.clear()
 
-    def _axis(self, axis: int, kind: str, number: int, points: int) -> Array:
-        key = (points, kind, axis, number)
+    def _axis(self, axis: int, kind: str, number: int, count: int) -> Array:
+        key = (count, kind, axis, number)
         if key not in self._shaped:
             pulses = shaper_pulses(kind, float(FREQUENCIES_HZ[number]), _ZETA)
-            index = self._points[points]
-            self._shaped[key] = shaped_at(self._answer[axis], self._dt_s, pulses, index)
+            points = self._points[count]
+            self._shaped[key] = shaped_at(self._answer[axis], self._dt_s, pulses, points)
         return self._shaped[key]
+
+
+def spread(samples: Ints, count: int) -> Ints:
+    """Return about `count` of the samples: one per cell, at random so as not to alias."""
+    step = max(1, len(samples) // count)
+    offset = np.random.default_rng(1).integers(0, step, len(samples) // step)
+    return np.asarray(samples[np.arange(len(offset)) * step + offset])
 
 
 def shaped_at(answer: Array, dt_s: float, pulses: tuple[Array, Array], index: Ints) -> Array:
@@ -302,36 +305,36 @@ def shaped_at(answer: Array, dt_s: float, pulses: tuple[Array, Array], index: In
 
 def _floors(trial: _Trial, kind: str) -> set[tuple[float, int, int]]:
     """Return the minima of the deepest valleys of one type: rms on many points, frequencies."""
-    coarse, fine = trial.points(_COARSE_POINTS), trial.points(_FINE_POINTS)
     grid = range(0, len(FREQUENCIES_HZ), _COARSE)
-    rough = sorted((trial.rms(kind, i, j, coarse), i, j) for i in grid for j in grid)
+    rough = sorted((trial.rms(kind, i, j, _COARSE_POINTS), i, j) for i in grid for j in grid)
     starts: list[tuple[int, int]] = []
     for _, i, j in rough:
         if all(max(abs(i - a), abs(j - b)) > 2 * _COARSE for a, b in starts):
             starts.append((i, j))
         if len(starts) == _STARTS:
             break
-    return {_descend(trial, kind, start, fine) for start in starts}
+    return {_descend(trial, kind, start, _FINE_POINTS) for start in starts}
 
 
 def _descend(
-    trial: _Trial, kind: str, start: tuple[int, int], points: int
+    trial: _Trial, kind: str, start: tuple[int, int], count: int
 ) -> tuple[float, int, int]:
-    """Descend on the full grid, searching up to three steps around."""
-    i, j = start
-    best = trial.rms(kind, i, j, points)
+    i, j = descend(lambda i, j: trial.rms(kind, i, j, count), start, _AROUND)
+    return trial.rms(kind, i, j, count), i, j
+
+
+def descend(
+    cost: Callable[[int, int], float], start: tuple[int, int], steps: Sequence[tuple[int, int]]
+) -> tuple[int, int]:
+    """Return indices of `FREQUENCIES_HZ`, of X and Y, from which no step lowers the cost."""
     top = len(FREQUENCIES_HZ) - 1
+    i, j = start
     while True:
-        around = [
-            (trial.rms(kind, a, b, points), a, b)
-            for reach in (1, 3)
-            for a, b in itertools.product((i - reach, i, i + reach), (j - reach, j, j + reach))
-            if 0 <= a <= top and 0 <= b <= top
-        ]
-        value, a, b = min(around)
-        if value >= best:
-            return best, i, j
-        best, i, j = value, a, b
+        around = [(i + a, j + b) for a, b in steps if 0 <= i + a <= top and 0 <= j + b <= top]
+        best = min(around, key=lambda pair: (cost(*pair), pair))
+        if cost(*best) >= cost(i, j):
+            return i, j
+        i, j = best
 
 
 def _with_rests(

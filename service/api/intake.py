@@ -20,6 +20,7 @@ from starlette.concurrency import run_in_threadpool
 from stillpath.applications.machines.resolve import PinnedMachine, Resolver
 from stillpath.applications.machines.revision import NotApproved, UnknownMachine
 from stillpath.models.errors import ModelError
+from stillpath.pipeline.files import result_name
 from stillpath.service.api.problems import Problem
 from stillpath.service.api.schemas import JobQuery
 from stillpath.service.api.uploads import Upload, receive_upload
@@ -225,7 +226,7 @@ class Intake:
             source_name=upload.name,
             source_bytes=upload.size_bytes,
             source_sha256=upload.sha256,
-            result_name=_result_name(upload.name, wanted.method),
+            result_name=upload.name if wanted.method == "live" else result_name(upload.name),
             created_at=time.time(),
             webhook=wanted.webhook,
             printer=wanted.printer,
@@ -418,15 +419,6 @@ def _fingerprint(wanted: JobQuery, upload: Upload) -> str:
 
 def _digest(*parts: object) -> str:
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
-
-
-def _result_name(source_name: str, method: str) -> str:
-    """Name the result; printers tell a sliced package by both of its suffixes."""
-    if method == "live":
-        return source_name  # it is the source
-    source = Path(source_name)
-    suffix = ".gcode.3mf" if source_name.lower().endswith(".gcode.3mf") else source.suffix
-    return f"{source_name[: len(source_name) - len(suffix)]}.stillpath{suffix or '.gcode'}"
 
 
 @contextmanager

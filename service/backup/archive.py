@@ -21,9 +21,10 @@ from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from typing import IO
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import ValidationError
 
-from stillpath.pipeline.files import replacing
+from stillpath.models.document import Document
+from stillpath.pipeline.files import replacing, sync
 from stillpath.service.instance_lock import exclusive
 from stillpath.version import __version__
 
@@ -42,10 +43,8 @@ class BackupError(Exception):
     """It cannot be backed up or restored; the message says what to do."""
 
 
-class Manifest(BaseModel):
+class Manifest(Document):
     """What an archive holds: SHA-256 and size in bytes of every file."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     version: str
     jobs: int
@@ -125,7 +124,7 @@ def restore(source: Path, data_dir: Path) -> Manifest:
         names = sorted(path.name for path in fresh.iterdir())
         for name in sorted(names, key=lambda name: name == DATABASE):
             (fresh / name).replace(data_dir / name)
-        _sync(data_dir)
+        sync(data_dir)
         fresh.rmdir()
     return manifest
 
@@ -319,15 +318,6 @@ def _clear(data_dir: Path) -> None:
         else:
             path.unlink()
     shutil.rmtree(data_dir / _RESTORING)  # last: until then we may begin anew
-
-
-def _sync(folder: Path) -> None:
-    if os.name != "nt":
-        handle = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)
 
 
 def _first_line(error: Exception) -> str:

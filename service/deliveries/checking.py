@@ -20,6 +20,7 @@ from stillpath.applications.machines.checks import differences
 from stillpath.applications.machines.documents import Documents
 from stillpath.compensation.defaults import DEFAULT_METHOD
 from stillpath.gcode.firmware.klipper.versions import ignores_shaper_frequencies
+from stillpath.models.document import Document
 from stillpath.models.errors import ModelError
 from stillpath.models.firmware import Klipper
 from stillpath.models.machine import Machine
@@ -132,10 +133,8 @@ class PrinterCheck(BaseModel):
         return [f"printer {self.printer}: {finding.text}" for finding in self.findings]
 
 
-class _Remembered(BaseModel):
+class _Remembered(Document):
     """A printer's configuration as it was when it was first checked with a machine."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     schema_version: Literal[1] = 1
     printer: str

@@ -8,9 +8,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, SecretStr, ValidationError, field_validator
+from pydantic import Field, SecretStr, ValidationError, field_validator
 
 from stillpath.models.complaints import complaint
+from stillpath.models.document import Document
 from stillpath.pipeline.options import BudgetUm, MethodName
 from stillpath.service.deliveries.http_requests import Reply, Unanswered, post
 from stillpath.service.deliveries.targets import TargetRefused, read_url
@@ -25,7 +26,7 @@ class PrinterFileError(ValueError):
     """The file of printers cannot be used."""
 
 
-class Printer(BaseModel):
+class Printer(Document):
     """A section ``[printer.NAME]`` of the file.
 
     Attributes
@@ -44,8 +45,6 @@ class Printer(BaseModel):
     start : bool
         Whether an upload may start a print. By default somebody must look at the printer first.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")]
     kind: Literal["moonraker", "octoprint"]

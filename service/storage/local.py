@@ -10,6 +10,7 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
+from stillpath.pipeline.files import sync
 from stillpath.service.storage.base import Room, Stat, StorageError
 from stillpath.service.storage.keys import check_key, check_prefix
 from stillpath.service.storage.leftovers import delete_leftovers
@@ -36,7 +37,7 @@ class LocalStorage:
         self._root = root
         with _explained():
             for folder in _make_folder(root / _FRESH):
-                _sync(folder)
+                sync(folder)
             delete_leftovers(root / _FRESH, "*")
 
     def put(self, key: str, file: Path) -> None:
@@ -53,7 +54,7 @@ class LocalStorage:
         changed: set[Path] = set()
         with _explained():
             for file in targets.values():
-                _sync(file)
+                sync(file)
             for target, file in targets.items():
                 try:
                     changed |= self._publish(file, target)
@@ -63,7 +64,7 @@ class LocalStorage:
                     changed |= self._copy(file, target)  # from another disk
             for folder in changed:
                 with contextlib.suppress(FileNotFoundError):  # deleted meanwhile
-                    _sync(folder)
+                    sync(folder)
 
     @contextlib.contextmanager
     def local(self, key: str) -> Iterator[Path]:
@@ -147,7 +148,7 @@ class LocalStorage:
         fresh = Path(name)
         try:
             shutil.copyfile(file, fresh)
-            _sync(fresh)
+            sync(fresh)
             changed = self._publish(fresh, target)
         except BaseException:
             fresh.unlink(missing_ok=True)
@@ -165,18 +166,6 @@ def _make_folder(folder: Path) -> set[Path]:
         changed |= _make_folder(folder.parent)
     folder.mkdir(exist_ok=True)
     return changed
-
-
-def _sync(path: Path) -> None:
-    """Wait until a file or the names in a folder are on the disk."""
-    if os.name == "nt" and path.is_dir():
-        return  # Windows opens no folders
-    # Windows syncs only what may be written to.
-    handle = os.open(path, os.O_RDWR if os.name == "nt" else os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 @contextlib.contextmanager

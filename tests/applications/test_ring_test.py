@@ -107,7 +107,7 @@ def test_a_travel_without_room_is_refused(machine: Machine) -> None:
 # What a log says
 
 
-def test_a_machine_like_its_plants_is_confirmed(told: RingReport, ring: Path, log: Path) -> None:
+def test_a_machine_like_its_plants_is_confirmed(told: RingReport, log: Path) -> None:
     assert verdicts(told) == ["confirmed", "confirmed"]
     for axis in told.axes:
         assert axis.as_planned is not None
@@ -169,7 +169,7 @@ def test_real_logs_of_other_motion_say_nothing(
         assert verdicts(report) == ["says nothing", "says nothing"]
 
 
-def test_a_ring_test_for_other_plants_says_nothing(ring: Path, log: Path, machine: Machine) -> None:
+def test_a_ring_test_for_other_plants_says_nothing(ring: Path, log: Path) -> None:
     other = machine_of({"x": Chain((45.0, 120.0)).spec(), "y": TRUE["y"].spec()})
     report = verify_ring(ring, [log], other, today=TODAY)
     assert verdicts(report) == ["says nothing", "confirmed"]

@@ -127,7 +127,7 @@ def test_files(tmp_path: Path) -> None:
     assert "<script" not in page
 
 
-def test_refusals(tmp_path: Path) -> None:
+def test_refusals() -> None:
     spec = load_loop("galvo-10khz")
     with pytest.raises(DesignError, match="--um-per-unit"):
         scan_file(EXAMPLE, spec, ScanSettings())

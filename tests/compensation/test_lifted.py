@@ -113,8 +113,6 @@ def test_taps_are_padded_and_truncated() -> None:
     taps = np.array([0.0, 0.5, 0.3])
     np.testing.assert_array_equal(lift(taps, 5).markov, [0, 0.5, 0.3, 0, 0])
     np.testing.assert_array_equal(lift(taps, 2).markov, [0, 0.5])
-    g = ToeplitzOperator(RNG(0).normal(size=9), RNG(1).normal(size=5))
-    np.testing.assert_array_equal(g.truncated(4).dense(), g.dense()[:4, :4])
 
 
 def test_time_varying_plant_keeps_its_state() -> None:
@@ -203,7 +201,6 @@ UNSTABLE = DiscretePlant(np.array([[1.02]]), np.ones(1), np.ones(1), 0.0)
         (lambda: lift(one_mode(), 0), "at least one"),
         (lambda: ToeplitzOperator([1.0, np.inf]), "not finite: is the plant unstable"),
         (lambda: ToeplitzOperator([1.0], [1.0]), "looks ahead"),
-        (lambda: ToeplitzOperator([1.0, 2.0]).truncated(3), "3 of 2 samples"),
         (lambda: lift([1.0], 4).apply(np.ones(3)), r"takes \(4,\) or \(4, k\)"),
         (lambda: lift([1.0], 4).apply_adjoint(np.ones((3, 2))), "output of shape"),
         (lambda: BlockOperator([[lift([1.0], 4), lift([1.0], 3)]]), r"output 0 .* \[3, 4\]"),

@@ -22,6 +22,7 @@ from stillpath.models.ripple import (
 )
 from stillpath.models.store import load_machine
 from stillpath.simulation.response import response
+from tests.models.test_ripple import drive as along_x
 
 DT = 1e-3
 FINER = 8
@@ -51,14 +52,7 @@ def rippled(machine: Machine, **ripple: AxisRipple) -> Machine:
 
 def drive(kind: str, seconds: float = 6.0, speed: float = 80.0) -> np.ndarray:
     """X goes, Y stands; at rest at both ends."""
-    t = np.arange(0, seconds, DT)
-    v = {
-        "constant": np.full(len(t), speed),
-        "ramp": np.interp(t, [0.2, seconds - 0.2], [30.0, 110.0]),
-        "stop and go": 60 * np.sin(2 * np.pi * t / 1.5) ** 2,
-    }[kind]
-    v = v * np.clip(np.minimum(t / 0.1, (seconds - t) / 0.1), 0, 1)
-    x = np.cumsum(v) * DT
+    x = along_x(kind, seconds, speed)
     return np.stack([x, np.zeros_like(x)])
 
 

@@ -15,8 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stillpath.pipeline.compensate import compensate_file
-from stillpath.pipeline.options import Options
+from tests.compensating import compensated
 from tests.fuzz.machines import machine_of
 from tests.gcode.plain_reader import read
 from tests.gcode.states import differences, tagged
@@ -113,10 +112,7 @@ def check(text: str, kind: str, cache: Path) -> bytes:
     """Every line finds the filament, place and modes of the original."""
     data, machine = tagged(text.encode()), machine_of(kind)
     with tempfile.TemporaryDirectory() as folder:
-        source, target = Path(folder, "in.gcode"), Path(folder, "out.gcode")
-        source.write_bytes(data)
-        compensate_file(source, target, machine, Options(), cache_dir=cache)
-        written = target.read_bytes()
+        _, written = compensated(data, Path(folder), cache, machine)
     assert differences(data, written, machine) == []
     return written
 

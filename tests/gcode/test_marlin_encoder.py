@@ -26,8 +26,7 @@ from stillpath.models.firmware import Marlin
 from stillpath.models.firmware.marlin import MarlinPlanner, MarlinShaper, PerAxis
 from stillpath.models.machine import CommandLimits, Machine
 from stillpath.models.store import load_machine
-from stillpath.pipeline.compensate import compensate_file
-from stillpath.pipeline.options import Options
+from tests.compensating import compensated
 from tests.gcode.cutting import HEAD, MARLIN_PLANNER
 from tests.gcode.prints import polygon
 from tests.gcode.states import differences, tagged
@@ -200,14 +199,11 @@ PRINT = HEAD + "G1 X120 Y100 F6000\n" + "\n".join(polygon(6, 15)) + "\nG1 E-1 F2
 
 
 def test_a_print_is_compensated_and_its_limits_come_back(tmp_path: Path, cache: Path) -> None:
-    source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"
-    source.write_text("M204 P1500 T1800\n" + PRINT)
     firmware = FIRMWARE.model_copy(update={"home_mm": (0.0, 0.0, 0.0)})
     machine = with_firmware(firmware)
-    result = compensate_file(source, target, machine, Options(), cache_dir=cache)
+    result, text = compensated("M204 P1500 T1800\n" + PRINT, tmp_path, cache, machine)
     assert result.pieces > 0
     assert result.put_back == []
-    text = target.read_bytes()
     assert b"M205 B0" in text
     interpreter = Interpreter(machine)
     blocks = [*interpreter.push(text), *interpreter.flush()]
@@ -223,14 +219,12 @@ def test_linear_advance_is_off_in_the_stream_and_on_again_after_it(
     tmp_path: Path, cache: Path, stated: bool | None
 ) -> None:
     """Whether the machine says that it has it or only the file does."""
-    source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"
-    source.write_text("M900 K0.05\n" + PRINT)
+    original = "M900 K0.05\n" + PRINT
     facts = {"home_mm": (0.0, 0.0, 0.0), "linear_advance": stated}
     machine = with_firmware(FIRMWARE.model_copy(update=facts))
-    result = compensate_file(source, target, machine, Options(), cache_dir=cache)
+    result, text = compensated(original, tmp_path, cache, machine)
     assert result.pieces > 0
     assert result.put_back == []
-    text = target.read_bytes()
     lines = text.decode().splitlines()
     on, off = (
         next(i for i, line in enumerate(lines) if line.startswith(f"; stillpath: stream {word}"))
@@ -240,7 +234,7 @@ def test_linear_advance_is_off_in_the_stream_and_on_again_after_it(
     assert known[0][1] == "M900 K0.05"
     assert {line for i, line in known if on < i < off - 8} == {"M900 K0"}
     assert next(line for i, line in known if i >= off - 8) == "M900 K0.05"
-    fed = [Interpreter(machine).push(source.read_bytes()), Interpreter(machine).push(text)]
+    fed = [Interpreter(machine).push(original.encode()), Interpreter(machine).push(text)]
     ends = [[b.moves.end_mm[-1, 3] for b in blocks if len(b.moves)][-1] for blocks in fed]
     assert ends[1] == pytest.approx(ends[0], abs=1e-4)
 
@@ -249,7 +243,6 @@ def test_linear_advance_is_off_in_the_stream_and_on_again_after_it(
 @pytest.mark.parametrize("mode", ["M82", "M83"])
 def test_far_from_zero_no_filament_is_lost(tmp_path: Path, cache: Path, mode: str) -> None:
     """Marlin adds up E in single precision: nine metres out a stream would lose a percent."""
-    source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"
     lines, e = [f"{mode}\nG92 E9000\nG1 X120 Y100 F6000"], 9000.0
     for k, line in enumerate(polygon(24, 20) * 3):
         place, _, fed = line.partition(" E")
@@ -259,12 +252,9 @@ def test_far_from_zero_no_filament_is_lost(tmp_path: Path, cache: Path, mode: st
             back, on = (f"{e - 1:.5f}", f"{e:.5f}") if mode == "M82" else ("-1", "1")
             lines += [f"G1 E{back} F2100", "G1 Z5.4 F600", "G1 Z5 F600", f"G1 E{on} F2100"]
     original = tagged((HEAD + "\n".join(lines) + "\nM221 S90\nM400\nG1 X50 Y50 F6000\n").encode())
-    source.write_bytes(original)
     machine = with_firmware(FIRMWARE.model_copy(update={"home_mm": (0.0, 0.0, 0.0)}))
-    options = Options(method="shaper:mzv")
-    result = compensate_file(source, target, machine, options, cache_dir=cache)
+    result, written = compensated(original, tmp_path, cache, machine, method="shaper:mzv")
     assert result.put_back == []
-    written = target.read_bytes()
     assert differences(original, written, machine) == []
     lost_mm, furthest_mm, reads_mm = in_single_precision(written)
     assert abs(lost_mm) < 1e-4

@@ -25,9 +25,8 @@ from stillpath.models.firmware.marlin import PerAxis
 from stillpath.models.machine import Machine
 from stillpath.models.plants import plant_set
 from stillpath.models.store import load_machine
-from stillpath.pipeline.compensate import compensate_file
-from stillpath.pipeline.options import Options
 from stillpath.simulation.response import response
+from tests.compensating import compensated
 from tests.gcode.cutting import HEAD, MARLIN_PLANNER
 from tests.gcode.prints import polygon
 
@@ -276,13 +275,11 @@ def test_a_stock_printer_executes_every_move_of_a_stream(tmp_path: Path, cache: 
         home_mm=(0.0, 0.0, 0.0),
     )
     machine = load_machine("ender3").model_copy(update={"firmware": firmware})
-    source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"
     print_ = "\n".join([*polygon(6, 15), *polygon(4, 2, (113.0, 100.0), feed=1800)])
-    source.write_text(HEAD + "G1 X115 Y100 F6000\n" + print_ + "\nG1 E-1 F2100\nG28 X\n")
-    result = compensate_file(source, target, machine, Options(), cache_dir=cache)
+    print_ = HEAD + "G1 X115 Y100 F6000\n" + print_ + "\nG1 E-1 F2100\nG28 X\n"
+    result, text = compensated(print_, tmp_path, cache, machine)
     assert result.put_back == []
     assert result.emission_max_um < 60.0
-    text = target.read_bytes()
     assert b"swallows moves below 6 steps (75 um)" in text
     assert shortest_hop(machine, text) >= 6
 

@@ -18,9 +18,8 @@ from stillpath.models.firmware.klipper import FirmwareShaper
 from stillpath.models.machine import Machine
 from stillpath.models.shaper_pulses import shaper_pulses
 from stillpath.models.store import load_machine
-from stillpath.pipeline.compensate import compensate_file
-from stillpath.pipeline.options import Options
 from stillpath.pipeline.result import Result
+from tests.compensating import compensated
 from tests.gcode.cutting import HEAD
 from tests.gcode.prints import made_up_print, polygon
 from tests.gcode.states import differences, states, tagged
@@ -41,12 +40,8 @@ class Pipeline:
         self.result: Result | None = None
 
     def __call__(self, data: bytes | str, machine: Machine | None = None) -> bytes:
-        text = data.encode() if isinstance(data, str) else data
-        source, target = self.folder / "in.gcode", self.folder / "out.gcode"
-        source.write_bytes(text)
-        used = machine or self.machine
-        self.result = compensate_file(source, target, used, Options(), cache_dir=self.cache)
-        return target.read_bytes()
+        self.result, written = compensated(data, self.folder, self.cache, machine or self.machine)
+        return written
 
 
 @pytest.fixture
@@ -257,7 +252,7 @@ def test_shaper_of_the_file_is_restored(pipeline: Pipeline) -> None:
     assert written.index(b"SHAPER_FREQ_X=0") < written.rindex(line) < written.rindex(b"G28")
 
 
-def test_rests_run_under_the_limits_of_the_file(pipeline: Pipeline, machine: Machine) -> None:
+def test_rests_run_under_the_limits_of_the_file(pipeline: Pipeline) -> None:
     """What we did not write must not meet our limits: retractions, hops, and after an M204."""
     rest = "G1 E-1 F2100\nG1 Z5.4 F600\nM204 S1500\nG1 Z5 F600\nG1 E1 F2100\n"
     lines = pipeline(tagged((HEAD + ROUND + rest + ROUND + "G4 P1\n").encode())).splitlines()

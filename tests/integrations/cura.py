@@ -3,7 +3,6 @@ calls it. After `plugins/PostProcessingPlugin` of Cura 4.13."""
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import re
 import sys
@@ -14,6 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+
+from tests.loading import module_at
 
 __all__ = ["SCRIPT", "Cura", "layers_of"]
 
@@ -84,12 +85,7 @@ class Cura:
     def load(self) -> Any:
         """Return a script of the user's list: the class is called as its file."""
         name = f"PostProcessingPlugin.PostProcessingPlugin.{SCRIPT.stem}"
-        spec = importlib.util.spec_from_file_location(name, SCRIPT)
-        assert spec is not None
-        assert spec.loader is not None
-        module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-        script = getattr(module, SCRIPT.stem)()
+        script = getattr(module_at(SCRIPT, name), SCRIPT.stem)()
         script.initialize()
         return script
 

@@ -42,7 +42,6 @@ SETTINGS: dict[str, dict[str, Any]] = {
     },
 }
 _TRADITIONAL = re.compile(r"[A-Z]\d+(\.\d+)?$")
-_NAME = re.compile(r"\s*([A-Z_]+[A-Z0-9_.]*)")
 
 
 class ConfigError(Exception):

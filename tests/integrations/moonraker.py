@@ -9,7 +9,6 @@ The contract is Moonraker 0.11's: server.py, confighelper.py, components/file_ma
 from __future__ import annotations
 
 import asyncio
-import importlib.util
 import inspect
 import os
 import re
@@ -25,6 +24,7 @@ from typing import Any
 import httpx2
 import pytest
 
+from tests.loading import module_at
 from tests.service.test_server import until
 
 __all__ = [
@@ -42,12 +42,7 @@ COMPONENT = Path(__file__).resolve().parents[2] / "integrations" / "moonraker" /
 
 def component_module() -> ModuleType:
     """Load the component's file, as Moonraker imports it from its own folder."""
-    spec = importlib.util.spec_from_file_location("moonraker_components_stillpath", COMPONENT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return module_at(COMPONENT, "moonraker_components_stillpath")
 
 
 class ServerError(Exception):

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
 import subprocess
-import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -14,6 +12,7 @@ import pytest
 
 from stillpath.compensation.live_filter import FADE, LiveFilter, design_taps
 from tests.compensation.test_live_filter import mode
+from tests.loading import module_at
 
 EXTRA = Path(__file__).resolve().parents[2] / "integrations/klipper/extra"
 DT_S = 1e-3
@@ -21,16 +20,7 @@ DT_S = 1e-3
 
 @pytest.fixture(scope="module")
 def extra() -> ModuleType:
-    spec = importlib.util.spec_from_file_location(
-        "klipper_extra_stillpath", EXTRA / "stillpath/__init__.py",
-        submodule_search_locations=[str(EXTRA / "stillpath")],
-    )  # fmt: skip
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
+    return module_at(EXTRA / "stillpath/__init__.py", "klipper_extra_stillpath")
 
 
 def zigzag(count: int, accel: float = 5e3, size: float = 40.0) -> list[tuple[float, ...]]:

@@ -83,7 +83,7 @@ def test_an_upload_gets_a_second_file(tmp_path: Path, running: Running):
     assert running.job_ids() == []
 
 
-def test_moonraker_recognises_what_we_write(tmp_path: Path):
+def test_moonraker_recognises_what_we_write():
     module = component_module()
     machine = load_machine("ender3")
     header = StreamWriter(adapter(machine), "1.2.3 machine=ender3").header().decode()
@@ -443,7 +443,7 @@ def test_a_component_without_its_repository(tmp_path: Path):
         with_component(tmp_path, lambda *_: None, script=str(tmp_path / "nowhere.py"))
 
 
-def test_the_macros(tmp_path: Path):
+def test_the_macros():
     called: list[tuple[str, dict[str, Any]]] = []
     printer = Klipper(macros_of(COMPONENT.with_name("stillpath-moonraker.cfg")))
     printer.remote = lambda name, **given: called.append((name, given))

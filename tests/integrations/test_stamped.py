@@ -93,7 +93,7 @@ def test_containers(tmp_path: Path, capsys: Any, name: str, content: bytes):
 
 
 @pytest.mark.slow
-def test_batch(file: Path, tmp_path: Path, capsys: Any):
+def test_batch(file: Path, tmp_path: Path):
     out = tmp_path / "out"
     command = ["batch", str(file), "--machine", "ender3", "-o", str(out), "--method", "none"]
     assert run(command) == 2

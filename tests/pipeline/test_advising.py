@@ -29,6 +29,7 @@ from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.result import Result
 from stillpath.pipeline.simulate import simulate_file
+from tests.compensating import compensated
 from tests.gcode.container_files import binary
 from tests.gcode.prints import polygon
 
@@ -63,13 +64,7 @@ def printed(layers: int = 3, filament: float = 1.0, head: str = HEAD) -> bytes:
 def advise(
     data: bytes, folder: Path, machine: Machine, cache: Path, **options: object
 ) -> tuple[Result, bytes]:
-    source, target = folder / "in.gcode", folder / "out.gcode"
-    source.write_bytes(data)
-    chosen = Options(method="advise", **options)
-    result = compensate_file(source, target, machine, chosen, cache_dir=cache)
-    assert source.read_bytes() == data
-    assert {p.name for p in folder.iterdir()} == {"in.gcode", "out.gcode"}
-    return result, target.read_bytes()
+    return compensated(data, folder, cache, machine, method="advise", **options)
 
 
 def without(written: bytes) -> bytes:

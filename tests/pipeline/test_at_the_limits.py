@@ -12,9 +12,9 @@ from stillpath.models.firmware import RepRapFirmware
 from stillpath.models.firmware.reprapfirmware import Drive
 from stillpath.models.machine import AxisTravel, CommandLimits, Machine
 from stillpath.models.store import load_machine
-from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.piece_compensator import PieceCompensator, deviation
+from tests.compensating import compensated
 from tests.gcode.cutting import HEAD, pieces_of
 
 
@@ -85,11 +85,8 @@ def test_a_fast_corexy_is_driven_more_gently_where_its_motors_would_step_too_far
 
 def test_what_climbs_too_fast_is_told(tmp_path: Path, cache: Path) -> None:
     """Moves that keep their own lines because Z could not follow are no secret."""
-    machine = load_machine("voron-v0")
     wall = "".join(f"G1 X{60 + 20 * (i % 2)} Z{6 + i} E1 F1200\n" for i in range(20))
-    source = tmp_path / "climb.gcode"
-    source.write_text(HEAD + wall)
-    result = compensate_file(source, tmp_path / "out.gcode", machine, Options(), cache_dir=cache)
+    result, _ = compensated(HEAD + wall, tmp_path, cache, "voron-v0")
     assert result.put_back == []
     assert any("climb faster than Z can follow" in warning for warning in result.warnings)
 
@@ -102,10 +99,8 @@ def test_where_the_shaper_would_serve_better_it_is_said(
     drive = Drive(steps_per_mm=steps_per_mm, max_speed_mm_s=300.0, max_accel_mm_s2=3000.0)
     own = RepRapFirmware(x=drive, y=drive, home_mm=(0.0, 0.0, 0.0))
     machine = load_machine("annex-k3").model_copy(update={"firmware": own})
-    source = tmp_path / "ring.gcode"
     ring = "G1 X84 Y77 E1\nG1 X59 Y84 E1\nG1 X37 Y61 E1\nG1 X60 Y50 E1\n"
-    source.write_text(HEAD + "G1 F6000\n" + 4 * ring)
-    result = compensate_file(source, tmp_path / "out.gcode", machine, Options(), cache_dir=cache)
+    result, _ = compensated(HEAD + "G1 F6000\n" + 4 * ring, tmp_path, cache, machine)
     assert ["as sliced" in one.reason for one in result.put_back] == [True] * told
     assert any("shaper would serve this file better" in w for w in result.warnings) is told
 

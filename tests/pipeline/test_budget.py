@@ -9,9 +9,8 @@ import pytest
 from stillpath.cli.console import budget_line
 from stillpath.models.store import load_machine
 from stillpath.pipeline import piece_compensator
-from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.options import Options
-from stillpath.pipeline.result import Result
+from tests.compensating import compensated
 from tests.gcode.cutting import HEAD
 from tests.gcode.prints import polygon
 from tests.pipeline.test_compensate import check_file
@@ -27,16 +26,6 @@ def sliced() -> bytes:
             lines += [f";TYPE:{name}\n", "G1 X120 Y100 F6000\n", "G92 E0\n"]
             lines += [line + "\n" for line in polygon(sides, size)]
     return "".join(lines).encode()
-
-
-def compensated(
-    data: bytes, folder: Path, cache: Path, machine: str = "ender3", **options: object
-) -> tuple[Result, bytes]:
-    source, target = folder / "in.gcode", folder / "out.gcode"
-    source.write_bytes(data)
-    chosen = Options.model_validate(options)
-    result = compensate_file(source, target, load_machine(machine), chosen, cache_dir=cache)
-    return result, target.read_bytes()
 
 
 @pytest.mark.slow

@@ -35,6 +35,7 @@ from stillpath.pipeline.result import ErrorFigures, Result
 from stillpath.pipeline.simulate import plan_file
 from stillpath.simulation.measures import contour_error
 from stillpath.simulation.response import response
+from tests.compensating import compensated
 from tests.gcode.cutting import HEAD, pieces_of
 from tests.gcode.prints import polygon
 from tests.gcode.states import differences, states, tagged
@@ -51,18 +52,6 @@ def wide(machine: Machine) -> Machine:
 
 def extruding(result: Result, channel: str) -> ErrorFigures:
     return next(c.extruding for c in result.channels if c.name == channel)
-
-
-def compensate(
-    data: bytes, folder: Path, cache: Path, machine: str | Machine = "ender3", **options: object
-) -> tuple[Result, bytes]:
-    source, target = folder / "in.gcode", folder / "out.gcode"
-    source.write_bytes(data)
-    made = load_machine(machine) if isinstance(machine, str) else machine
-    result = compensate_file(source, target, made, Options(**options), cache_dir=cache)
-    assert source.read_bytes() == data
-    assert sorted(p.name for p in folder.iterdir()) == ["in.gcode", "out.gcode"]
-    return result, target.read_bytes()
 
 
 def check_file(original: bytes, written: bytes, machine: Machine) -> None:
@@ -84,7 +73,7 @@ def check_file(original: bytes, written: bytes, machine: Machine) -> None:
 @pytest.mark.parametrize("name", ["ender3", "generic-corexy"])
 def test_example(tmp_path: Path, cache: Path, name: str) -> None:
     data = tagged(b"".join(EXAMPLE.read_bytes().splitlines(keepends=True)[:1200]))
-    result, written = compensate(data, tmp_path, cache, name)
+    result, written = compensated(data, tmp_path, cache, name)
     machine = load_machine(name)
     before, after = extruding(result, "before"), extruding(result, "after")
     assert after.contour_rms_um <= before.contour_rms_um / 4
@@ -102,14 +91,14 @@ def test_example(tmp_path: Path, cache: Path, name: str) -> None:
 
 
 def test_stamped_file_is_refused(tmp_path: Path, cache: Path) -> None:
-    _, written = compensate(SMALL, tmp_path, cache)
+    _, written = compensated(SMALL, tmp_path, cache)
     again = tmp_path / "again"
     again.mkdir()
     (again / "in.gcode").write_bytes(written)
     with pytest.raises(GcodeError, match=r"line \d+: this file was already processed by stillpath"):
-        compensate(written, again, cache)
+        compensated(written, again, cache)
     with pytest.raises(GcodeError, match="already processed"):
-        compensate(written, again, cache, method="none")
+        compensated(written, again, cache, method="none")
     assert [p.name for p in again.iterdir()] == ["in.gcode"]
     plan_file(again / "in.gcode", again / "motion.npz", load_machine("ender3"))
     with np.load(again / "motion.npz") as motion:
@@ -138,7 +127,7 @@ def test_a_file_without_its_comments_is_refused_too(
 
 def test_method_none_returns_the_bytes(tmp_path: Path, cache: Path) -> None:
     for data in (SMALL, SMALL.rstrip(), SMALL.replace(b"\n", b"\r\n")):
-        result, written = compensate(data, tmp_path, cache, method="none")
+        result, written = compensated(data, tmp_path, cache, method="none")
         assert written == data
         assert result.put_back == []
         assert [c.label for c in result.channels][:2] == ["as sliced", "as written"]
@@ -150,7 +139,7 @@ def test_method_none_returns_the_bytes(tmp_path: Path, cache: Path) -> None:
 )
 def test_other_methods(tmp_path: Path, cache: Path, options: dict[str, str]) -> None:
     data = tagged(SMALL)
-    result, written = compensate(data, tmp_path, cache, **options)
+    result, written = compensated(data, tmp_path, cache, **options)
     assert result.put_back == []
     before, after = extruding(result, "before"), extruding(result, "after")
     assert after.contour_rms_um < 0.9 * before.contour_rms_um
@@ -162,7 +151,7 @@ def test_other_methods(tmp_path: Path, cache: Path, options: dict[str, str]) -> 
 def test_other_methods_stand_on_the_plan_in_rests(tmp_path: Path, cache: Path, method: str) -> None:
     # Motions end and begin between samples: with the command beside the plan's own rest, the
     # filament of a whole move would fall on a hundredth of a micrometre.
-    result, written = compensate(EXAMPLE.read_bytes(), tmp_path, cache, method=method)
+    result, written = compensated(EXAMPLE.read_bytes(), tmp_path, cache, method=method)
     assert result.put_back == []
     check_file(EXAMPLE.read_bytes(), written, load_machine("ender3"))
 
@@ -172,17 +161,17 @@ def test_a_machine_beyond_the_method_gets_the_reason_and_no_file(
     tmp_path: Path, cache: Path
 ) -> None:
     with pytest.raises(DesignError, match=r"axis x: ebzpetc: .* use ts or fbf"):
-        compensate(SMALL, tmp_path, cache, "taz6-x", method="ebzpetc")
+        compensated(SMALL, tmp_path, cache, "taz6-x", method="ebzpetc")
     assert [p.name for p in tmp_path.iterdir()] == ["in.gcode"]
 
 
 def test_same_bytes(tmp_path: Path, cache: Path) -> None:
-    written = [compensate(SMALL, tmp_path, cache)[1] for _ in range(2)]
+    written = [compensated(SMALL, tmp_path, cache)[1] for _ in range(2)]
     assert written[0] == written[1]
 
 
 def test_in_place(tmp_path: Path, cache: Path) -> None:
-    _, expected = compensate(SMALL, tmp_path, cache)
+    _, expected = compensated(SMALL, tmp_path, cache)
     path = tmp_path / "in.gcode"
     compensate_file(path, path, load_machine("ender3"), Options(), cache_dir=cache)
     # The name of the file is no part of it.
@@ -358,7 +347,7 @@ def test_real_prints(
 ) -> None:
     data = corpus(shared_dir, f"{name}.gcode.gz", lines)
     used = permissive(load_machine(machine))
-    result, written = compensate(data, tmp_path, cache, used)
+    result, written = compensated(data, tmp_path, cache, used)
     assert result.put_back_extruding_share <= 0.01
     assert result.time_s <= 1.005 * result.original_time_s
     before, after = extruding(result, "before"), extruding(result, "after")
@@ -415,10 +404,10 @@ def test_what_the_last_check_refuses_stays_as_sliced(
     monkeypatch.setattr(StreamWriter, name, wrong)
     if spoilt == "verbatim lines":
         with pytest.raises(LastCheckError, match="M117 not of the file"):
-            compensate(data, tmp_path, cache, method="shaper:mzv")
+            compensated(data, tmp_path, cache, method="shaper:mzv")
         assert [p.name for p in tmp_path.iterdir()] == ["in.gcode"]
         return
-    result, written = compensate(data, tmp_path, cache, method="shaper:mzv")
+    result, written = compensated(data, tmp_path, cache, method="shaper:mzv")
     assert strange not in written
     assert result.pieces > 3
     assert result.last_check is not None

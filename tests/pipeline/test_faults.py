@@ -11,6 +11,7 @@ from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.piece_compensator import PieceCompensator
 from stillpath.pipeline.progress import Progress
+from tests.compensating import compensated
 from tests.pipeline.test_compensate import check_file
 
 HEAD = "G28\nM83\nG90\nG1 X50 Y50 Z0.2 F6000\n"
@@ -32,15 +33,12 @@ def test_a_fault_of_ours_costs_one_piece(
 
     monkeypatch.setattr(PieceCompensator, "compensate", faulty)
     data = (HEAD + 3 * (SQUARE + STOP)).encode()
-    source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"
-    source.write_bytes(data)
-    machine = load_machine("ender3")
-    result = compensate_file(source, target, machine, Options(), cache_dir=cache)
+    result, written = compensated(data, tmp_path, cache)
     (fault,) = result.put_back
     assert "internal error (IndexError: index 3 is out of bounds)" in fault.reason
     assert fault.reason.startswith(f"line {fault.line_first}:")
     assert len(calls) > 2
-    check_file(data, target.read_bytes(), machine)
+    check_file(data, written, load_machine("ender3"))
 
 
 @pytest.mark.parametrize("method", ["fbf", "advise"])
@@ -67,9 +65,6 @@ def test_a_file_that_is_replaced_meanwhile_stays(method: str, tmp_path: Path, ca
 @pytest.mark.parametrize("name", ["ender3", "generic-corexy"])
 def test_moves_below_the_grid_of_a_file(name: str, tmp_path: Path, cache: Path) -> None:
     data = (HEAD + SQUARE + STOP + TINY + STOP + SQUARE).encode()
-    source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"
-    source.write_bytes(data)
-    machine = load_machine(name)
-    result = compensate_file(source, target, machine, Options(), cache_dir=cache)
+    result, written = compensated(data, tmp_path, cache, name)
     assert all("internal error" not in piece.reason for piece in result.put_back)
-    check_file(data, target.read_bytes(), machine)
+    check_file(data, written, load_machine(name))

@@ -12,9 +12,8 @@ from stillpath.gcode.errors import GcodeError
 from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine
-from stillpath.pipeline.compensate import compensate_file
-from stillpath.pipeline.options import Options
 from stillpath.pipeline.result import Result
+from tests.compensating import compensated
 from tests.gcode.prints import polygon
 
 EXAMPLES = Path(__file__).parents[2] / "examples" / "firmware"
@@ -50,12 +49,9 @@ def machine_with(kind: str, **firmware: object) -> Machine:
     return Machine.model_validate(document | {"firmware": section})
 
 
-def compensated(text: str, machine: Machine, folder: Path, cache: Path) -> tuple[Result, list[str]]:
-    source, target = folder / "in.gcode", folder / "out.gcode"
-    source.write_text(text)
-    options = Options(method="zpetc")
-    result = compensate_file(source, target, machine, options, cache_dir=cache)
-    return result, target.read_text().splitlines()
+def by_zpetc(text: str, machine: Machine, folder: Path, cache: Path) -> tuple[Result, list[str]]:
+    result, written = compensated(text, folder, cache, machine, method="zpetc")
+    return result, written.decode().splitlines()
 
 
 def moves_by_shaper(lines: list[str], kind: str) -> tuple[set[tuple[str, str]], str]:
@@ -84,7 +80,7 @@ def test_it_is_off_in_stretches_and_on_around_them(
         if place == "start code"
         else f"{HEAD}{PART}{SETS[kind]} ; mine\n{PART}{BEHIND}"
     )
-    result, lines = compensated(text, machine_with(kind), tmp_path, cache)
+    result, lines = by_zpetc(text, machine_with(kind), tmp_path, cache)
     assert result.put_back == []
     under, last = moves_by_shaper(lines, kind)
     assert ("stream", "on") not in under
@@ -100,11 +96,11 @@ def test_a_machine_that_states_no_shaper_and_a_file_that_sets_one(tmp_path: Path
     """Marlin: without one in the document none is switched off, but for the file's own."""
     off = {"freq_x_hz": 0.0, "freq_y_hz": 0.0}
     machine = machine_with("marlin", shaper=off)
-    _, lines = compensated(f"{SETS['marlin']}\n{HEAD}{PART}{BEHIND}", machine, tmp_path, cache)
+    _, lines = by_zpetc(f"{SETS['marlin']}\n{HEAD}{PART}{BEHIND}", machine, tmp_path, cache)
     under, last = moves_by_shaper(lines, "marlin")
     assert ("stream", "on") not in under
     assert last == "on"
-    _, lines = compensated(f"{HEAD}{PART}{BEHIND}", machine, tmp_path, cache)
+    _, lines = by_zpetc(f"{HEAD}{PART}{BEHIND}", machine, tmp_path, cache)
     assert not [line for line in lines if line.startswith("M593")]
 
 
@@ -125,7 +121,7 @@ def test_an_axis_whose_shaper_nobody_states_is_told(
 ):
     """What a stream switched off there cannot be set again: only the printer knows what it was."""
     machine = machine_with(kind, shaper=None)
-    result, lines = compensated(f"{line}\n{HEAD}{PART}{BEHIND}", machine, tmp_path, cache)
+    result, lines = by_zpetc(f"{line}\n{HEAD}{PART}{BEHIND}", machine, tmp_path, cache)
     assert lines.count(line) > 1
     told = [w.split(" is not known")[0] for w in result.warnings if "is not known (firm" in w]
     assert told == ([] if whose is None else [f"The firmware's own input shaper{whose}"])
@@ -134,7 +130,7 @@ def test_an_axis_whose_shaper_nobody_states_is_told(
 def test_without_one_nothing_is_said(tmp_path: Path, cache: Path):
     text = f"M572 S0.04\n{HEAD}{PART}{BEHIND}"
     for kind in SETS:
-        result, _ = compensated(text, machine_with(kind), tmp_path, cache)
+        result, _ = by_zpetc(text, machine_with(kind), tmp_path, cache)
         assert not [line for line in result.warnings if "sets the firmware's" in line]
 
 
@@ -152,12 +148,12 @@ def test_without_one_nothing_is_said(tmp_path: Path, cache: Path):
 )
 def test_fixed_time_motion_is_refused_with_line_and_remedy(line: str, tmp_path: Path, cache: Path):
     with pytest.raises(GcodeError, match=r"line 2: M493 .* on top of .*; take it out"):
-        compensated(f"G28\n{line}\n{PART}", machine_with("marlin"), tmp_path, cache)
+        by_zpetc(f"G28\n{line}\n{PART}", machine_with("marlin"), tmp_path, cache)
     assert [path.name for path in tmp_path.iterdir()] == ["in.gcode"]
 
 
 def test_fixed_time_motion_that_is_off_or_that_the_machine_has(tmp_path: Path, cache: Path):
     for line in ("M493 S0", "M493", "M493 V", "M495 X F20", "M496"):
-        compensated(f"{line}\n{HEAD}{PART}{BEHIND}", machine_with("marlin"), tmp_path, cache)
+        by_zpetc(f"{line}\n{HEAD}{PART}{BEHIND}", machine_with("marlin"), tmp_path, cache)
     with pytest.raises(ModelError, match="fixed-time motion"):
-        compensated(HEAD + PART, machine_with("marlin", ft_motion=True), tmp_path, cache)
+        by_zpetc(HEAD + PART, machine_with("marlin", ft_motion=True), tmp_path, cache)

@@ -15,6 +15,7 @@ from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.measuring.reference_shaper import cached_shaper
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.simulate import plan_file, simulate_file
+from tests.compensating import compensated
 from tests.gcode.prints import polygon
 from tests.gcode.states import differences, tagged
 
@@ -46,11 +47,8 @@ def body(kind: str) -> bytes:
 @pytest.mark.parametrize("kind", KINDS)
 def test_compensated(kind: str, tmp_path: Path, cache: Path) -> None:
     machine = machine_with(kind)
-    source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"
     data = tagged(body(kind))
-    source.write_bytes(data)
-    result = compensate_file(source, target, machine, Options(), cache_dir=cache)
-    written = target.read_bytes()
+    result, written = compensated(data, tmp_path, cache, machine)
     assert result.put_back == []
     assert result.pieces >= 1
     assert differences(data, written, machine) == []
@@ -63,33 +61,25 @@ def test_compensated(kind: str, tmp_path: Path, cache: Path) -> None:
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_move_of_less_than_a_step_alone(kind: str, tmp_path: Path, cache: Path) -> None:
     """Seen by fuzzing: of a wipe that the motors round away nothing is left but its filament."""
-    source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"
     lines = ("G28", "G90", "M83", "G1 X78.802 Y50 F6000", "G4 P1", "G1 X78.800 Y50 E-.17", "G4 P1")
     data = tagged("\n".join([*lines, "G1 X90 E1", ""]).encode())
-    source.write_bytes(data)
-    compensate_file(source, target, machine_with(kind), Options(), cache_dir=cache)
-    assert differences(data, target.read_bytes(), machine_with(kind)) == []
+    _, written = compensated(data, tmp_path, cache, machine_with(kind))
+    assert differences(data, written, machine_with(kind)) == []
 
 
 def test_a_turn_that_the_shaper_makes_shorter_than_marlins_least_move(
     tmp_path: Path, cache: Path
 ) -> None:
     """Seen by fuzzing: nothing of .1 mm there and back was left to write."""
-    source = tmp_path / "in.gcode"
-    source.write_text("G1 X100 Y100 E0\nM221 S95\nG1 Y100.1\nG1 Y100.0\n")
-    options = Options(method="shaper:ei")
-    machine = machine_with("marlin")
-    result = compensate_file(source, tmp_path / "out.gcode", machine, options, cache_dir=cache)
+    text = "G1 X100 Y100 E0\nM221 S95\nG1 Y100.1\nG1 Y100.0\n"
+    result, _ = compensated(text, tmp_path, cache, machine_with("marlin"), method="shaper:ei")
     (piece,) = result.put_back
     assert piece.reason == "line 3: all moves round to zero at the resolution of a file"
 
 
 def test_marlins_g90_is_followed_by_m83(tmp_path: Path, cache: Path) -> None:
-    source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"
-    source.write_bytes(body("marlin"))
-    compensate_file(source, target, machine_with("marlin"), Options(), cache_dir=cache)
-    text = target.read_text()
-    stream = text[text.index("stream on") :]
+    _, written = compensated(body("marlin"), tmp_path, cache, machine_with("marlin"))
+    stream = written.decode().partition("stream on")[2]
     ours = re.findall(r"^G90\nM83\nG1 X", stream, re.MULTILINE)
     assert ours
     assert not re.search(r"^G90\nG1 X", stream, re.MULTILINE)
@@ -97,11 +87,8 @@ def test_marlins_g90_is_followed_by_m83(tmp_path: Path, cache: Path) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_none_keeps_every_byte(kind: str, tmp_path: Path, cache: Path) -> None:
-    source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"
-    source.write_bytes(body(kind))
-    options = Options(method="none")
-    compensate_file(source, target, machine_with(kind), options, cache_dir=cache)
-    assert target.read_bytes() == body(kind)
+    _, written = compensated(body(kind), tmp_path, cache, machine_with(kind), method="none")
+    assert written == body(kind)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -142,8 +129,8 @@ def test_a_dialect_that_the_machine_does_not_read_is_refused(tmp_path: Path) -> 
 
 def test_a_file_for_another_firmware_is_doubted(tmp_path: Path, cache: Path) -> None:
     foreign = b"; gcode_flavor = reprapfirmware\nM566 X600 Y600 Z30 E300\n"
-    source = tmp_path / "in.gcode"
-    source.write_bytes(foreign + body("reprapfirmware"))
+    source, data = tmp_path / "in.gcode", foreign + body("reprapfirmware")
+    source.write_bytes(data)
     marlin, motion = machine_with("marlin"), tmp_path / "m.npz"
     (warning,) = plan_file(source, motion, marlin).warnings
     assert "written for reprapfirmware (gcode_flavor = reprapfirmware; " in warning
@@ -152,9 +139,7 @@ def test_a_file_for_another_firmware_is_doubted(tmp_path: Path, cache: Path) -> 
     assert plan_file(source, motion, marlin, dialect="marlin").warnings == []
     assert plan_file(source, motion, machine_with("reprapfirmware")).warnings == []
     assert simulate_file(source, marlin, cache_dir=cache).warnings[0] == warning
-    target = tmp_path / "out.gcode"
-    compensated = compensate_file(source, target, marlin, Options(), cache_dir=cache)
-    assert warning in compensated.warnings
+    assert warning in compensated(data, tmp_path, cache, marlin)[0].warnings
 
 
 def test_klipper_reads_marlins_flavour(tmp_path: Path) -> None:
@@ -165,10 +150,8 @@ def test_klipper_reads_marlins_flavour(tmp_path: Path) -> None:
 
 def test_a_rest_with_a_feedrate_that_marlin_passes_over(tmp_path: Path, cache: Path) -> None:
     """It has the file's F, not the stream's."""
-    source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"
     lines = ("G28", "G90", "M83", "G1 X50 Y50 F3000", "G1 X90 E1", "G1 E-1 F0", "G1 X60 Y60")
     data = tagged("\n".join([*lines, "G1 E1 F-5", "G1 X90 E1", ""]).encode())
-    source.write_bytes(data)
-    result = compensate_file(source, target, machine_with("marlin"), Options(), cache_dir=cache)
+    result, written = compensated(data, tmp_path, cache, machine_with("marlin"))
     assert result.put_back == []
-    assert differences(data, target.read_bytes(), machine_with("marlin")) == []
+    assert differences(data, written, machine_with("marlin")) == []

@@ -19,6 +19,7 @@ from stillpath.pipeline.live_printing import simulate_live
 from stillpath.pipeline.options import Options, stamp
 from stillpath.pipeline.progress import Cancelled, Progress
 from stillpath.pipeline.result import Result
+from tests.compensating import compensated
 
 PENTAGON = b"G28\nG90\nM83\nG1 Z0.3 F600\nG1 X60 Y60 F9000\n" + b"".join(
     b"G1 X%.3f Y%.3f E2 F6000\n" % (100 + 40 * np.cos(1.2566 * k), 100 + 40 * np.sin(1.2566 * k))
@@ -125,10 +126,8 @@ def test_a_machine_that_cannot_print_live_says_why(
 def test_a_file_that_sets_the_shaper_says_why(
     machine: Machine, cache: Path, tmp_path: Path
 ) -> None:
-    source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"
     line = b"SET_INPUT_SHAPER SHAPER_TYPE=mzv SHAPER_FREQ_X=40 SHAPER_FREQ_Y=40\n"
-    source.write_bytes(line + PENTAGON)
-    found = compensate_file(source, target, machine, BOTH, cache_dir=cache)
+    found, _ = compensated(line + PENTAGON, tmp_path, cache, machine, compare_live=True)
     assert found.not_live.startswith("the file sets the firmware's shaper (mzv")
     assert found.ways == []
 
@@ -175,6 +174,15 @@ def test_the_filter_is_kept_and_made_again_if_damaged(
     assert path.read_bytes() == kept
     assert again.taps.tolist() == first.taps.tolist()
     assert again.contour_um == first.contour_um
+
+
+@pytest.mark.slow
+def test_dry_friction_is_in_what_a_filter_leaves(machine: Machine, cache: Path) -> None:
+    """No filter makes up for it."""
+    axes = {k: v.model_copy(update={"friction_mm": 0.03}) for k, v in machine.axes.items()}
+    rubbing = machine.model_copy(update={"axes": axes})
+    clean, rubbed = (cached_live_design(one, cache).contour_um for one in (machine, rubbing))
+    assert rubbed["live"][0] > clean["live"][0] + 10.0
 
 
 def test_the_comparison_is_no_setting_of_the_written_file(machine: Machine) -> None:

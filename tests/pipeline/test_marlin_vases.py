@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from stillpath.models.machine import Machine
-from stillpath.pipeline.compensate import compensate_file
-from stillpath.pipeline.options import Options
+from tests.compensating import compensated
 from tests.gcode.cutting import ender3_with
 from tests.gcode.prints import vase
 
@@ -28,17 +27,14 @@ def test_a_vase_is_compensated(
     text = vase(speed_mm_s, turns=abs(turns))
     if turns < 0:  # it sinks
         text = re.sub(r"(?<= Z)[\d.]+", lambda z: f"{2.0 - float(z[0]):.3f}", text)
-    source, target = tmp_path / "vase.gcode", tmp_path / "out.gcode"
-    source.write_text(text)
-    machine, options = Machine.model_validate(document), Options()
-    result = compensate_file(source, target, machine, options, cache_dir=cache)
+    result, written = compensated(text, tmp_path, cache, Machine.model_validate(document))
     assert result.put_back == []
     rms_um = result.features[0].contour_rms_um
     assert rms_um["after"] < rms_um["shaper"] < rms_um["before"]
     assert rms_um["after"] < (3.0 if junction == "deviation" else 5.0)
 
     # Z climbs evenly, by a step at a time, and comes to where the file says.
-    stream = target.read_text().split("stillpath: stream on\n")[1].split("stream off")[0]
+    stream = written.decode().split("stillpath: stream on\n")[1].split("stream off")[0]
     z_steps = Z_STEPS_PER_MM * np.array([float(z) for z in re.findall(r"G1.* Z([\d.]+)", stream)])
     assert np.abs(np.diff(z_steps)).max() < 1.01
     assert z_steps[-1] == pytest.approx(Z_STEPS_PER_MM * float(re.findall(r" Z([\d.]+)", text)[-1]))

@@ -12,13 +12,12 @@ from stillpath.gcode.pieces import Piece
 from stillpath.models.machine import Machine
 from stillpath.models.schedule import EMPTY
 from stillpath.models.store import load_machine
-from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.measuring.points import MotionSamples
-from stillpath.pipeline.options import Options
 from stillpath.pipeline.piece_compensator import Unfit
 from stillpath.pipeline.result import Result
 from stillpath.pipeline.simulate import simulate_file
 from stillpath.pipeline.verifying import Verifier
+from tests.compensating import compensated
 from tests.gcode.cutting import HEAD, pieces_of
 
 FIRMWARES = Path(__file__).parents[2] / "examples" / "firmware"
@@ -47,9 +46,7 @@ def test_rounding_to_steps_is_an_error(kind: str, tmp_path: Path, cache: Path) -
     source.write_text(LINES)
     seen = rms_um(simulate_file(source, machine, cache_dir=cache))
     for method in ("none", "fbf"):
-        options = Options(method=method)
-        result = compensate_file(source, tmp_path / "out.gcode", machine, options, cache_dir=cache)
-        found = rms_um(result)
+        found = rms_um(compensated(LINES, tmp_path, cache, machine, method=method)[0])
         assert found["before"] == pytest.approx(5.0, abs=0.3)
         assert found["before"] == pytest.approx(seen["before"], abs=0.05)
         assert found["shaper"] == pytest.approx(seen["shaper"], abs=0.05)
@@ -61,13 +58,10 @@ def test_a_wipe_on_the_spot_may_wait(tmp_path: Path, cache: Path) -> None:
     wipe = "G1 Z5.2 F600\nG1 E1 F2100\nG1 F8640\n" + "".join(
         f"G1 X110 Y60.{y} E-.01\n" for y in ("080", "043", "005")
     )
-    source = tmp_path / "wipe.gcode"
-    source.write_text(f"{LINES}{wipe}G4 P500\nG1 E-.8 F2100\nG1 X60 Y60 F6000\n")
-    machine = machine_with("marlin")
-    result = compensate_file(source, tmp_path / "out.gcode", machine, Options(), cache_dir=cache)
+    text = f"{LINES}{wipe}G4 P500\nG1 E-.8 F2100\nG1 X60 Y60 F6000\n"
+    result, written = compensated(text, tmp_path, cache, machine_with("marlin"))
     assert result.put_back == []
-    written = tmp_path / "out.gcode"
-    assert "Y60.043" not in written.read_text()
+    assert b"Y60.043" not in written
 
 
 @pytest.mark.parametrize("junction", ["classic_jerk", "deviation"])
@@ -85,10 +79,8 @@ def test_moves_of_single_steps_lose_no_time(
         x_mm += 0.0 if across else -0.0125 if back else 0.0125
         y_mm += 0.0125 * across
         lines.append(f"G1 X{x_mm:.4f} Y{y_mm:.4f} E.001 F600")
-    source = tmp_path / "steps.gcode"
-    source.write_text("\n".join([*lines, "G1 X110 E1 F3000", "G1 Y90 E1", ""]))
-    machine = Machine.model_validate(document)
-    result = compensate_file(source, tmp_path / "out.gcode", machine, Options(), cache_dir=cache)
+    text = "\n".join([*lines, "G1 X110 E1 F3000", "G1 Y90 E1", ""])
+    result, _ = compensated(text, tmp_path, cache, Machine.model_validate(document))
     assert not [one.reason for one in result.put_back if "from its command" in one.reason]
 
 
@@ -109,10 +101,8 @@ def test_sudden_corners_are_rounded(tmp_path: Path, cache: Path) -> None:
             places = 60.0 + 60.0j + radius * np.exp(0.25j * np.pi * np.arange(9))
             sides = [f"G1 X{p.real:.3f} Y{p.imag:.3f}" for p in places.tolist()]
             lines += [f"{sides[0]} F6000", *(f"{side} E.5" for side in sides[1:])]
-    source = tmp_path / "rings.gcode"
-    source.write_text("\n".join(lines) + "\n")
-    machine = Machine.model_validate(document)
-    result = compensate_file(source, tmp_path / "out.gcode", machine, Options(), cache_dir=cache)
+    text = "\n".join(lines) + "\n"
+    result, _ = compensated(text, tmp_path, cache, Machine.model_validate(document))
     assert result.put_back == []
     found = rms_um(result)
     assert found["after"] < 0.5 * found["shaper"] < 0.5 * found["before"]
@@ -125,12 +115,10 @@ def test_marlin_follows_travel_as_fast_as_commands_may_be(tmp_path: Path, cache:
     planner["max_accel_mm_s2"] |= {"x": 8000.0, "y": 8000.0}
     planner["max_feedrate_mm_s"] |= {"x": 300.0, "y": 300.0}
     document["command"]["velocity_mm_s"] = 300.0
-    source = tmp_path / "travel.gcode"
     fast = "G1 X160 F24000\nG1 Y61 E1\nG1 X20 Y60 F24000\nG1 X160 Y180 F24000\nG1 X20 Y60 F24000\n"
     head = "G28\nG90\nM83\nM204 P8000 T8000\nG1 X20 Y60 Z5 F6000\n"
-    source.write_text(head + 4 * (fast + "G1 X40 Y70 E1 F6000\nG1 X20 Y60 E1\n"))
-    machine = Machine.model_validate(document)
-    result = compensate_file(source, tmp_path / "out.gcode", machine, Options(), cache_dir=cache)
+    text = head + 4 * (fast + "G1 X40 Y70 E1 F6000\nG1 X20 Y60 E1\n")
+    result, _ = compensated(text, tmp_path, cache, Machine.model_validate(document))
     assert result.put_back == []
 
 

@@ -12,8 +12,8 @@ from stillpath.models.machine import Machine
 from stillpath.models.plants import Mode, ModesSpec, PlantSetSpec
 from stillpath.models.ripple import AxisRipple, RippleHarmonic, RippleSource
 from stillpath.models.store import load_machine
-from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.options import Options
+from tests.compensating import compensated
 
 
 def print_file() -> str:
@@ -36,32 +36,21 @@ def rippled() -> Machine:
 
 @pytest.mark.slow
 def test_nine_tenths_are_gone_from_the_written_file(tmp_path: Path, cache: Path) -> None:
-    source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"
-    source.write_text(print_file())
     left = {}
     for method in ("fbf", "fbf+ripple"):
-        options = Options(method=method, tolerance_um=1.0)
-        result = compensate_file(source, target, rippled(), options, cache_dir=cache)
+        options = {"method": method, "tolerance_um": 1.0}
+        result, written = compensated(print_file(), tmp_path, cache, rippled(), **options)
         assert result.put_back == []
         left[method] = next(
             c.extruding.tracking_rms_um for c in result.channels if c.name == "after"
         )
-    assert f"method={'fbf+ripple'}" in target.read_text()[:200]
+    assert b"method=fbf+ripple" in written[:200]
     assert left["fbf+ripple"] < 0.1 * left["fbf"]
 
 
 def test_a_machine_without_ripple_says_so(tmp_path: Path, cache: Path) -> None:
-    source = tmp_path / "in.gcode"
-    source.write_text(print_file())
-    machine = load_machine("ender3")
     with pytest.raises(DesignError, match="no ripple is known"):
-        compensate_file(
-            source,
-            tmp_path / "out.gcode",
-            machine,
-            Options(method="none+ripple"),
-            cache_dir=cache,
-        )
+        compensated(print_file(), tmp_path, cache, method="none+ripple")
     assert not (tmp_path / "out.gcode").exists()
 
 

@@ -19,11 +19,9 @@ from stillpath.models.provenance import Provenance
 from stillpath.models.schedule import AxisSchedule, GridNode, GridSchedule, MassSchedule
 from stillpath.models.store import load_machine
 from stillpath.pipeline.band import NOTABLE_UM, BandContent
-from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.operating_point import Operation
-from stillpath.pipeline.options import Options
-from stillpath.pipeline.result import Result
 from stillpath.pipeline.simulate import simulate_file
+from tests.compensating import compensated
 
 ROOT = Path(__file__).resolve().parents[2]
 KG_PER_MM = 1e-6 * 1.24 * 0.25 * math.pi * 1.75**2
@@ -101,22 +99,14 @@ def test_where_a_piece_is() -> None:
     assert Operation(machine).at(kept[0]).z_mm == 9.0
 
 
-def compensated(
-    text: str, folder: Path, machine: Machine, cache: Path, **options: object
-) -> tuple[Result, list[bytes]]:
-    source, target = folder / "in.gcode", folder / "out.gcode"
-    source.write_text(text)
-    result = compensate_file(source, target, machine, Options(**options), cache_dir=cache)
-    return result, target.read_bytes().splitlines()
-
-
 def test_one_operating_point_writes_the_same_bytes(tmp_path: Path, cache: Path) -> None:
-    plain, expected = compensated(block(), tmp_path, bedslinger(None), cache)
-    result, written = compensated(block(), tmp_path, bedslinger(1e5), cache)
+    plain, expected = compensated(block(), tmp_path, cache, bedslinger(None))
+    result, written = compensated(block(), tmp_path, cache, bedslinger(1e5))
     # Only the stamps name the machine's revision.
-    stamp = b"; Processed by stillpath"
-    assert [x for x in written if stamp not in x] == [x for x in expected if stamp not in x]
-    assert written[0] != expected[0]
+    stamp, lines = b"; Processed by stillpath", [x.splitlines() for x in (written, expected)]
+    ours, theirs = ([x for x in each if stamp not in x] for each in lines)
+    assert ours == theirs
+    assert lines[0][0] != lines[1][0]
     figures, wanted = (one.channels[1].extruding.model_dump() for one in (result, plain))
     assert figures == pytest.approx(wanted, rel=1e-8)
     assert plain.notes == []
@@ -125,7 +115,7 @@ def test_one_operating_point_writes_the_same_bytes(tmp_path: Path, cache: Path) 
 def test_follows_the_print(tmp_path: Path, cache: Path) -> None:
     """A light bed: 40 g of print beside 50 g of bed, on the way up."""
     machine = bedslinger(0.05, density=12.4)
-    result, written = compensated(block(16), tmp_path, machine, cache)
+    result, written = compensated(block(16), tmp_path, cache, machine)
     assert result.put_back == []
     (note,) = result.notes
     printed_kg = 16 * 40 * 10 * KG_PER_MM
@@ -135,9 +125,9 @@ def test_follows_the_print(tmp_path: Path, cache: Path) -> None:
     before, after = (c.extruding.contour_rms_um for c in result.channels[:2])
     assert after < 0.15 * before
     # The same file made for the bed as it was.
-    _, fixed = compensated(block(16), tmp_path, bedslinger(None), cache)
-    assert fixed[1:] != written[1:]
-    again, same = compensated(block(16), tmp_path, machine, cache)
+    _, fixed = compensated(block(16), tmp_path, cache, bedslinger(None))
+    assert fixed.splitlines()[1:] != written.splitlines()[1:]
+    again, same = compensated(block(16), tmp_path, cache, machine)
     assert same == written
     assert again.channels == result.channels
 
@@ -160,7 +150,7 @@ def test_heights(tmp_path: Path, cache: Path) -> None:
     machine = bedslinger(None).model_copy(
         update={"schedules": {"x": AxisSchedule(grid=GridSchedule(nodes=nodes))}}
     )
-    result, _ = compensated(block(10), tmp_path, machine, cache)
+    result, _ = compensated(block(10), tmp_path, cache, machine)
     assert "position in z: its lowest resonance was between 36.0 and 45.0 Hz." in result.notes[0]
     assert result.channels[1].extruding.contour_rms_um < 1.5
 
@@ -189,12 +179,12 @@ def test_content_of_a_sine() -> None:
 
 
 def test_band_is_warned_of(tmp_path: Path, cache: Path) -> None:
-    narrow, _ = compensated(block(3), tmp_path, banded(25.0), cache)
+    narrow, _ = compensated(block(3), tmp_path, cache, banded(25.0))
     assert any("Axis y" in w and "above 25 Hz" in w for w in narrow.warnings)
-    phase, _ = compensated(block(3), tmp_path, banded(None, 20.0), cache)
+    phase, _ = compensated(block(3), tmp_path, cache, banded(None, 20.0))
     assert any("above 20 Hz, where its model cannot be trusted" in w
                for w in phase.warnings)  # fmt: skip
-    wide, _ = compensated(block(3), tmp_path, banded(130.0), cache)
+    wide, _ = compensated(block(3), tmp_path, cache, banded(130.0))
     assert not any("planned motion" in w for w in wide.warnings)
 
 

@@ -7,10 +7,8 @@ from pathlib import Path
 import pytest
 
 from stillpath.models.store import load_machine
-from stillpath.pipeline.compensate import compensate_file
-from stillpath.pipeline.options import Options
-from stillpath.pipeline.result import Result
 from stillpath.pipeline.simulate import plan_file, simulate_file
+from tests.compensating import compensated
 from tests.gcode.cutting import HEAD
 from tests.gcode.prints import polygon
 
@@ -23,15 +21,6 @@ TEXT = (
 ).encode()
 
 
-def compensated(folder: Path, cache: Path, **options: object) -> tuple[Result, list[bytes]]:
-    source, target = folder / "in.gcode", folder / "out.gcode"
-    source.write_bytes(TEXT)
-    machine = load_machine("ender3")
-    result = compensate_file(source, target, machine, Options(**options), cache_dir=cache)
-    assert sorted(p.name for p in folder.iterdir()) == ["in.gcode", "out.gcode"]
-    return result, target.read_bytes().splitlines()
-
-
 def elapsed(lines: list[bytes]) -> list[float]:
     start = b";TIME_ELAPSED:"
     return [float(x.removeprefix(start)) for x in lines if x.startswith(start)]
@@ -39,7 +28,8 @@ def elapsed(lines: list[bytes]) -> list[float]:
 
 def test_times_follow_the_motion(tmp_path: Path, cache: Path) -> None:
     # A robust design weighs the path more than the time.
-    result, lines = compensated(tmp_path, cache, along=0.01)
+    result, written = compensated(TEXT, tmp_path, cache, along=0.01)
+    lines = written.splitlines()
     delay_s = result.time_s - result.original_time_s
     first, last = (b - a for a, b in zip((50.0, 100.0), elapsed(lines), strict=True))
     assert last == pytest.approx(delay_s, abs=0.02)
@@ -49,7 +39,8 @@ def test_times_follow_the_motion(tmp_path: Path, cache: Path) -> None:
 
 
 def test_the_ends_of_the_file_stay_the_slicers(tmp_path: Path, cache: Path) -> None:
-    _, lines = compensated(tmp_path, cache)
+    _, written = compensated(TEXT, tmp_path, cache)
+    lines = written.splitlines()
     assert lines[0] == b";FLAVOR:Marlin"
     assert lines[-1] == b";SETTING_3 {}"
     stamps = [k for k, line in enumerate(lines) if line.startswith(b"; Processed by stillpath")]
@@ -59,9 +50,11 @@ def test_the_ends_of_the_file_stay_the_slicers(tmp_path: Path, cache: Path) -> N
 
 
 def test_kept_times_and_the_method_none(tmp_path: Path, cache: Path) -> None:
-    _, lines = compensated(tmp_path, cache, times="kept", along=0.01)
+    _, written = compensated(TEXT, tmp_path, cache, times="kept", along=0.01)
+    lines = written.splitlines()
     assert elapsed(lines) == [50.0, 100.0]
-    _, lines = compensated(tmp_path, cache, method="none")
+    _, written = compensated(TEXT, tmp_path, cache, method="none")
+    lines = written.splitlines()
     assert b"\n".join(lines) + b"\n" == TEXT
 
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from stillpath.pipeline.compensate import compensate_file
-from stillpath.pipeline.options import Options
+from tests.compensating import compensated
 from tests.fuzz.machines import machine_of
 
 _SETS = re.compile(r"M572(?: D([\d:]+))? S([\d.]+)$")
@@ -41,13 +40,11 @@ def advances(text: str, default_s: float) -> list[dict[int, float]]:
     return found
 
 
-def test_each_tool_keeps_its_own(tmp_path: Path) -> None:
+def test_each_tool_keeps_its_own(tmp_path: Path, cache: Path) -> None:
     machine = machine_of("reprapfirmware")
-    source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"
-    source.write_text(_PRINT)
-    result = compensate_file(source, target, machine, Options(method="shaper:mzv"))
+    result, text = compensated(_PRINT, tmp_path, cache, machine, method="shaper:mzv")
     assert result.pieces - len(result.put_back) >= 5
-    written = target.read_text()
+    written = text.decode()
     assert "M572 S0\n" in written
     wanted = advances(_PRINT, machine.pressure_advance_s)
     assert len(wanted) == 7

@@ -6,14 +6,15 @@ import os
 import re
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import httpx2
+
+from tests.service.jobs.site import until
 
 __all__ = ["GEAR", "PART", "PATIENCE_MS", "Service", "running"]
 
@@ -31,7 +32,6 @@ SERVE = [
 ]
 PATIENCE_MS = 240_000
 """For whatever a job or an identification takes on a loaded machine."""
-_ADDRESS = re.compile(r"stillpath: (http\S+?)/?\s*$")
 
 
 @dataclass(frozen=True)
@@ -55,17 +55,7 @@ class Service:
             job: dict[str, Any] = self.api.get(f"/v1/jobs/{job_id}").json()
             return job if job["state"] in ("done", "failed", "cancelled") else None
 
-        return until(ask)
-
-
-def until(wanted: Callable[[], Any]) -> Any:
-    deadline = time.monotonic() + PATIENCE_MS / 1e3
-    while time.monotonic() < deadline:
-        found = wanted()
-        if found:
-            return found
-        time.sleep(0.1)
-    raise AssertionError("waited in vain")
+        return until(ask, PATIENCE_MS / 1e3)
 
 
 @contextmanager
@@ -86,7 +76,7 @@ def running(data_dir: Path, key: str | None = None, **environment: str) -> Itera
                 u[1] for line in lines if (u := re.match(r"stillpath: (http\S+?)/?\s*$", line))
             )
             with httpx2.Client(base_url=url, timeout=60, headers=headers) as api:
-                until(lambda: _is_ready(api))
+                until(lambda: _is_ready(api), PATIENCE_MS / 1e3)
                 yield Service(url, api)
         finally:
             process.terminate()

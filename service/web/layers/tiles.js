@@ -6,8 +6,6 @@ import { request } from "../lib/api.js";
 export const UNKNOWN_ERROR = 65535;
 /** What stands for errors that are larger than can be written. */
 export const LARGEST_ERROR = 65534;
-/** What stands for no feature. */
-export const UNNAMED = 255;
 /** Micrometres of one step of a stored error. */
 export const ERROR_STEP_UM = 0.1;
 

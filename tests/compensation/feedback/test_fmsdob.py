@@ -318,7 +318,7 @@ def test_interpolation_is_exact_for_a_polynomial() -> None:
     assert interpolating_fir(w, values) == pytest.approx(taps, abs=1e-12)
 
 
-def test_documents(tmp_path: object) -> None:
+def test_documents() -> None:
     made = fmsdob(SLOW.loops(), [1500.0])
     document = json.loads(made.to_json(curves=True))
     assert document["method"] == "fmsdob"

@@ -20,8 +20,9 @@ from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.last_check.comparing import LastCheck
 from stillpath.pipeline.last_check.errors import LastCheckError
 from stillpath.pipeline.options import Options
-from stillpath.pipeline.result import LastCheckFigures, Result
+from stillpath.pipeline.result import LastCheckFigures
 from stillpath.service.jobs.problems import problem_of
+from tests.compensating import compensated
 from tests.fuzz.machines import machine_of
 from tests.gcode.container_files import binary, package
 
@@ -69,16 +70,6 @@ MODES = (b"M82\n", b"M83\n", b"G90\n", b"G91\n")
 KINDS = ("klipper", "marlin", "reprapfirmware")
 
 
-def make(
-    data: bytes, machine: Machine, folder: Path, cache: Path, method: str = "shaper:mzv"
-) -> tuple[Result, bytes]:
-    folder.mkdir(exist_ok=True)
-    source, target = folder / "in.gcode", folder / "out.gcode"
-    source.write_bytes(data)
-    result = compensate_file(source, target, machine, Options(method=method), cache_dir=cache)
-    return result, target.read_bytes()
-
-
 def check(
     original: bytes, written: bytes, machine: Machine, part: int = 1 << 20
 ) -> LastCheckFigures:
@@ -102,7 +93,8 @@ def good(
     """A machine, and what the print becomes for it."""
     machine = machine_of(request.param)
     folder = tmp_path_factory.mktemp(request.param)
-    _, written = make(PRINT.encode(), machine, folder, cache)
+    folder.mkdir(exist_ok=True)
+    _, written = compensated(PRINT, folder, cache, machine, method="shaper:mzv")
     assert written.count(b"stream on") >= 2
     return machine, written
 
@@ -224,7 +216,7 @@ def test_a_file_that_ends_too_early_is_found(good: tuple[Machine, bytes]) -> Non
 
 def test_what_it_cannot_follow_is_said(tmp_path: Path, cache: Path) -> None:
     text = PRINT.replace("M117 bye\n", "PARK_SOMEWHERE\nG1 E.1\nG1 Y52 E.1\n")
-    result, _ = make(text.encode(), machine_of("klipper"), tmp_path, cache)
+    result, _ = compensated(text, tmp_path, cache, machine_of("klipper"), method="shaper:mzv")
     assert result.last_check is not None
     homing, parking = result.last_check.not_compared
     assert homing.startswith("from line 2 up to line")
@@ -240,7 +232,7 @@ def test_many_streams_without_a_line_that_stays(kind: str, tmp_path: Path, cache
     parts = f"; STILLPATH_OFF\n{square}; STILLPATH_ON\n{square}"
     data = ("G28\nM83\nG90\nG1 X50 Y50 Z.2 F6000\n" + 5 * parts).encode()
     machine = machine_of(kind)
-    result, written = make(data, machine, tmp_path, cache)
+    result, written = compensated(data, tmp_path, cache, machine, method="shaper:mzv")
     assert written.count(b"; stillpath: stream off") >= 5
     assert result.last_check is not None
     assert result.last_check.compared_lines >= 20
@@ -255,7 +247,7 @@ def test_many_streams_without_a_line_that_stays(kind: str, tmp_path: Path, cache
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 def test_examples_pass(kind: str, path: Path, tmp_path: Path, cache: Path) -> None:
     data = b"".join(path.read_bytes().splitlines(keepends=True)[:1500])
-    result, written = make(data, machine_of(kind), tmp_path, cache)
+    result, written = compensated(data, tmp_path, cache, machine_of(kind), method="shaper:mzv")
     assert result.last_check is not None
     assert result.last_check.kept_lines > 20
     assert result.last_check.compared_lines > 1
@@ -504,10 +496,7 @@ LAYER_AGAIN = (
     ],
 )
 def test_what_files_of_chance_found(kind: str, text: str, tmp_path: Path, cache: Path) -> None:
-    source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"
-    source.write_text(text)
-    options = Options(method="shaper:mzv")
-    result = compensate_file(source, target, machine_of(kind), options, cache_dir=cache)
+    result, _ = compensated(text, tmp_path, cache, machine_of(kind), method="shaper:mzv")
     assert not any("internal error" in piece.reason for piece in result.put_back)
     assert result.pieces > len(result.put_back)
     assert result.last_check is not None

@@ -18,11 +18,19 @@ import tempfile
 import time
 import uuid
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
-__all__ = ["MISSING", "PostgresServer", "is_installed", "postgres_server", "postgres_url"]
+__all__ = [
+    "MISSING",
+    "PostgresServer",
+    "is_installed",
+    "postgres_server",
+    "postgres_url",
+    "running_server",
+]
 
 MISSING = "no PostgreSQL: install Debian's `postgresql`, or put its initdb and postgres on the PATH"
 
@@ -119,10 +127,9 @@ def is_installed() -> bool:
     return _programs() is not None
 
 
-@pytest.fixture(scope="session")
-def postgres_server() -> Iterator[PostgresServer]:
-    """Run a server for the session."""
-    assert is_installed(), MISSING  # a test is stopped before, by its marker
+@contextmanager
+def running_server() -> Iterator[PostgresServer]:
+    """Run a server in a folder of its own."""
     folder = Path(tempfile.mkdtemp(prefix="sp-pg-"))
     folder.chmod(0o755)
     server = PostgresServer(folder / "server")
@@ -132,6 +139,14 @@ def postgres_server() -> Iterator[PostgresServer]:
     finally:
         server.stop()
         shutil.rmtree(folder, ignore_errors=True)
+
+
+@pytest.fixture(scope="session")
+def postgres_server() -> Iterator[PostgresServer]:
+    """Run a server for the session."""
+    assert is_installed(), MISSING  # a test is stopped before, by its marker
+    with running_server() as server:
+        yield server
 
 
 @pytest.fixture

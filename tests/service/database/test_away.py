@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import shutil
 import signal
 import sqlite3
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,21 +15,14 @@ from stillpath.service.jobs.state import JobState
 from stillpath.service.jobs.store import JobStore
 from stillpath.service.settings import Settings
 from tests.service.database.examples import finished, make_job
-from tests.service.database.postgres import PostgresServer
+from tests.service.database.postgres import PostgresServer, running_server
 
 
 @pytest.fixture
 def server(postgres_server: PostgresServer) -> Iterator[PostgresServer]:
     """A server of the test's own; `postgres_server` only decides whether there can be one."""
-    folder = Path(tempfile.mkdtemp(prefix="sp-pg-"))
-    folder.chmod(0o755)
-    own = PostgresServer(folder / "server")
-    try:
-        own.start()
+    with running_server() as own:
         yield own
-    finally:
-        own.stop()
-        shutil.rmtree(folder, ignore_errors=True)
 
 
 @pytest.mark.postgresql

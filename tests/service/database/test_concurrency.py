@@ -8,10 +8,8 @@ import random
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections import Counter
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -31,6 +29,7 @@ from stillpath.service.jobs.state import Cancelled, Event, Failed, JobState, Los
 from stillpath.service.jobs.store import JobStore
 from stillpath.service.jobs.submissions import Quota, QuotaExceeded
 from stillpath.service.settings import Settings
+from tests.service.at_once import at_once
 from tests.service.database.examples import finished, make_job, take_all
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -39,26 +38,6 @@ ROOT = Path(__file__).resolve().parents[3]
 @pytest.fixture
 def store(engine: Engine) -> JobStore:
     return JobStore(engine)
-
-
-def at_once(*calls: Callable[[], object]) -> list[object]:
-    """Call all in threads of their own, started together, and return what they return."""
-    results: list[object] = [None] * len(calls)
-    start = threading.Barrier(len(calls))
-
-    def one(n: int) -> None:
-        start.wait()
-        try:
-            results[n] = calls[n]()
-        except Exception as error:
-            results[n] = error
-
-    threads = [threading.Thread(target=one, args=(n,)) for n in range(len(calls))]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    return results
 
 
 def test_many_first_starts_at_once(settings: Settings):

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -17,6 +17,7 @@ from stillpath.applications.machines.store import MachineStore
 from stillpath.service.database.documents import DocumentTable, open_documents
 from stillpath.service.database.engine import open_database
 from stillpath.service.settings import Settings
+from tests.service.at_once import at_once
 from tests.service.machines import make_confirmation, make_machine, with_accel
 
 PLACES = ["folder", "sqlite", pytest.param("postgresql", marks=pytest.mark.postgresql)]
@@ -32,24 +33,6 @@ def documents(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Docume
     engine = open_database(Settings(data_dir=tmp_path, database_url=url))
     yield DocumentTable(engine, "machines")
     engine.dispose()
-
-
-def together(*calls: Callable[[], None]) -> None:
-    """Call all at once; fails if one fails."""
-    failed: list[BaseException] = []
-
-    def one(call: Callable[[], None]) -> None:
-        try:
-            call()
-        except BaseException as error:
-            failed.append(error)
-
-    threads = [threading.Thread(target=one, args=(call,)) for call in calls]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert failed == []
 
 
 def test_a_document_is_written_once(documents: Documents):
@@ -115,7 +98,7 @@ def test_one_of_many_takes_a_name(documents: Documents):
                 documents.create(f"mine/{number}", str(writer))
                 taken.append(writer)
 
-        together(*[lambda n=n, take=take: take(n) for n in range(6)])  # type: ignore[misc]
+        assert at_once(*(partial(take, n) for n in range(6))) == [None] * 6
         (winner,) = taken
         assert documents.read(f"mine/{number}") == str(winner).encode()
 
@@ -129,7 +112,7 @@ def test_writers_of_one_machine_lose_nothing(documents: Documents):
             machine = with_accel(make_machine(), 1000.0 * (writer + 1) + k)
             store.add_revision("mine", machine, author=f"writer-{writer}")
 
-    together(*[lambda n=n: write(n) for n in range(3)])  # type: ignore[misc]
+    assert at_once(*(partial(write, n) for n in range(3))) == [None] * 3
     history = store.history("mine")
     assert [r.number for r in history] == [*range(1, 14)]
     for writer in range(3):
@@ -149,7 +132,7 @@ def test_ring_tests_at_once_do_not_undo_each_other(documents: Documents):
         for k in range(3):
             store.confirm("mine", {axis: make_confirmation(5.0 + k)}, author=axis)
 
-    together(lambda: test("x"), lambda: test("y"))
+    assert at_once(partial(test, "x"), partial(test, "y")) == [None, None]
     last = store.current("mine")
     assert last.number == 7
     assert last.machine.confirmations == dict.fromkeys("xy", make_confirmation(7.0))
@@ -169,7 +152,7 @@ def test_writers_beside_somebody_who_deletes(documents: Documents):
                 if k % 2:
                     store.restore("mine")
 
-    together(write, delete)
+    assert at_once(write, delete) == [None, None]
     history = store.history("mine") if "mine" in store else []
     assert [r.number for r in history] == [*range(1, len(history) + 1)]
 

@@ -7,13 +7,16 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from stillpath.service.deliveries import sender
 from stillpath.service.deliveries.http_requests import Reply
 from stillpath.service.deliveries.printers import PrinterFileError, load_printers, printer_for
+from stillpath.service.deliveries.rows import Delivery
 from stillpath.service.deliveries.targets import TargetRefused
+from stillpath.service.jobs.state import Job
 from tests.service.deliveries.listeners import Listener, Seen, moonraker, octoprint, until, uploads
 from tests.service.deliveries.places import RESULT, SECRET, Place, open_place
 
@@ -31,17 +34,21 @@ def at(tmp_path: Path, text: str):
     return open_place(tmp_path / "data", printers=file)
 
 
+def delivered(
+    folder: Path, server: Listener, kind: str = "moonraker", *, prints: bool, **of_printer: Any
+) -> tuple[Job, Delivery]:
+    """Finish a job and send its result to a printer."""
+    url = server.url + ("/octo" if kind == "octoprint" else "/")
+    with at(folder, printer("m", kind, url, **of_printer)) as place:
+        job = place.finish(folder, printer="m", print_after=prints)
+        with place.sending():
+            return job, place.settled(job)
+
+
 @pytest.mark.parametrize("prints", [False, True])
 def test_moonraker_gets_the_whole_file_and_checks_it(tmp_path: Path, prints: bool):
-    with (
-        moonraker(key="k1") as server,
-        at(
-            tmp_path, printer("m", "moonraker", server.url + "/", api_key="k1", start=True)
-        ) as place,
-    ):
-        job = place.finish(tmp_path, printer="m", print_after=prints)
-        with place.sending():
-            delivery = place.settled(job)
+    with moonraker(key="k1") as server:
+        job, delivery = delivered(tmp_path, server, prints=prints, api_key="k1", start=True)
     assert (delivery.state, delivery.error) == ("done", None)
     [seen] = uploads(server)
     parts = seen.parts()
@@ -53,15 +60,10 @@ def test_moonraker_gets_the_whole_file_and_checks_it(tmp_path: Path, prints: boo
 
 @pytest.mark.parametrize("prints", [False, True])
 def test_octoprint_gets_it_below_a_prefix(tmp_path: Path, prints: bool):
-    with (
-        octoprint(key="k2") as server,
-        at(
-            tmp_path, printer("o", "octoprint", server.url + "/octo", api_key="k2", start=True)
-        ) as place,
-    ):
-        job = place.finish(tmp_path, printer="o", print_after=prints)
-        with place.sending():
-            assert place.settled(job).state == "done"
+    how = {"prints": prints, "api_key": "k2", "start": True}
+    with octoprint(key="k2") as server:
+        job, delivery = delivered(tmp_path, server, "octoprint", **how)
+    assert delivery.state == "done"
     [seen] = uploads(server)
     parts = seen.parts()
     assert parts["file"] == (job.result_name, RESULT)
@@ -77,13 +79,8 @@ def test_a_failed_job_goes_to_no_printer(tmp_path: Path):
 
 
 def test_a_wrong_key_is_told_and_not_repeated(tmp_path: Path):
-    with (
-        moonraker(key="right") as server,
-        at(tmp_path, printer("m", "moonraker", server.url, api_key="wrong")) as place,
-    ):
-        job = place.finish(tmp_path, printer="m")
-        with place.sending():
-            delivery = place.settled(job)
+    with moonraker(key="right") as server:
+        _, delivery = delivered(tmp_path, server, prints=False, api_key="wrong")
     assert (delivery.state, len(uploads(server))) == ("failed", 1)
     assert "401" in (delivery.error or "")
     assert "wrong" not in (delivery.error or "")
@@ -91,14 +88,9 @@ def test_a_wrong_key_is_told_and_not_repeated(tmp_path: Path):
 
 @pytest.mark.parametrize("kind", ["moonraker", "octoprint"])
 def test_a_printer_that_does_not_begin_is_told(tmp_path: Path, kind: str):
-    busy, prefix = (moonraker, "") if kind == "moonraker" else (octoprint, "/octo")
-    with (
-        busy(key="k", can_print=False) as server,
-        at(tmp_path, printer("m", kind, server.url + prefix, api_key="k", start=True)) as place,
-    ):
-        job = place.finish(tmp_path, printer="m", print_after=True)
-        with place.sending():
-            delivery = place.settled(job)
+    busy = moonraker if kind == "moonraker" else octoprint
+    with busy(key="k", can_print=False) as server:
+        _, delivery = delivered(tmp_path, server, kind, prints=True, api_key="k", start=True)
     assert delivery.state == "done"
     assert "did not begin" in (delivery.error or "")
 
@@ -117,10 +109,8 @@ def test_a_page_is_no_answer_of_a_printer(tmp_path: Path):
 
 
 def test_a_printer_that_must_not_be_started_is_not(tmp_path: Path):
-    with moonraker() as server, at(tmp_path, printer("m", "moonraker", server.url)) as place:
-        job = place.finish(tmp_path, printer="m", print_after=True)
-        with place.sending():
-            delivery = place.settled(job)
+    with moonraker() as server:
+        _, delivery = delivered(tmp_path, server, prints=True)
     assert (delivery.state, server.seen) == ("failed", [])
     assert "start = true" in (delivery.error or "")
 
@@ -154,7 +144,6 @@ def test_a_printer_that_is_off_gets_it_when_it_is_on(tmp_path: Path):
 @pytest.mark.parametrize("answer", ["silence", "502", "page"])
 def test_a_print_is_not_started_twice(tmp_path: Path, answer: str):
     """Nobody knows whether the first upload began to print: it is left to a person."""
-    servers: list[Listener] = []
 
     def answers(_: Seen):
         if answer == "silence":
@@ -163,14 +152,8 @@ def test_a_print_is_not_started_twice(tmp_path: Path, answer: str):
             return 200, {"Content-Type": "text/html"}, b"<html>log in"
         return 502, {}, b"bad gateway"
 
-    with (
-        Listener(answers) as server,
-        at(tmp_path, printer("m", "moonraker", server.url, start=True)) as place,
-    ):
-        servers.append(server)
-        job = place.finish(tmp_path, printer="m", print_after=True)
-        with place.sending():
-            delivery = place.settled(job)
+    with Listener(answers) as server:
+        _, delivery = delivered(tmp_path, server, prints=True, start=True)
     assert (delivery.state, len(uploads(server))) == ("failed", 1)
     assert "may have been started" in (delivery.error or "")
 
@@ -189,13 +172,8 @@ def test_a_sender_that_breaks_starts_no_second_print(
         return judge(reply)
 
     monkeypatch.setattr(sender, "_judged", breaks_once)
-    with (
-        Listener(lambda _: (201, {}, b"{}")) as server,
-        at(tmp_path, printer("m", "moonraker", server.url, start=True)) as place,
-    ):
-        job = place.finish(tmp_path, printer="m", print_after=prints)
-        with place.sending():
-            delivery = place.settled(job)
+    with Listener(lambda _: (201, {}, b"{}")) as server:
+        _, delivery = delivered(tmp_path, server, prints=prints, start=True)
     if prints:
         assert (delivery.state, len(uploads(server))) == ("failed", 1)
         assert "may have been started" in (delivery.error or "")

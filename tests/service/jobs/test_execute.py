@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Thread
@@ -20,13 +19,6 @@ from stillpath.service.jobs.worker import Workplace, execute
 from stillpath.service.storage import StorageError
 from tests.service.jobs.site import Site, until
 from tests.service.runners import light
-
-
-@pytest.fixture
-def site(tmp_path: Path) -> Iterator[Site]:
-    site = Site(tmp_path / "data")
-    yield site
-    site.close()
 
 
 @dataclass

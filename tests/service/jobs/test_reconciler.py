@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -52,13 +52,6 @@ class Workers:
     def submit(self, job: Job, when_done: Callable[[], object]) -> Handed:
         self.handed.append(Handed())
         return self.handed[-1]
-
-
-@pytest.fixture
-def site(tmp_path: Path) -> Iterator[Site]:
-    site = Site(tmp_path / "data")
-    yield site
-    site.close()
 
 
 def looking(site: Site, workers: Workers) -> Reconciler:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
@@ -13,13 +11,6 @@ from stillpath.service.jobs.state import Cancelled
 from stillpath.service.jobs.sweep import Sweep, sweep_files
 from tests.service.database.examples import finished
 from tests.service.jobs.site import Site
-
-
-@pytest.fixture
-def site(tmp_path: Path) -> Iterator[Site]:
-    site = Site(tmp_path / "data")
-    yield site
-    site.close()
 
 
 def put(site: Site, key: str) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -22,6 +21,7 @@ from stillpath.service.security.keys import (
     keys_needed,
 )
 from stillpath.service.settings import Settings
+from tests.service.at_once import at_once
 
 
 class Clock:
@@ -147,19 +147,7 @@ def test_a_weak_first_key_is_refused(store: KeyStore, tmp_path: Path, given: str
 
 
 def test_of_several_processes_one_makes_the_first_key(engine: Engine):
-    made: list[str | None] = []
-    gate = threading.Barrier(8)
-
-    def start() -> None:
-        store = KeyStore(engine)
-        gate.wait()
-        made.append(store.create_first())
-
-    threads = [threading.Thread(target=start) for _ in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    made = at_once(*[KeyStore(engine).create_first for _ in range(8)])
     assert len([secret for secret in made if secret is not None]) == 1
     assert len(KeyStore(engine).list()) == 1
 
