@@ -261,7 +261,7 @@ class _AxisWork:
             frame = None if frame_firm else _frame(responses, common)
             responses = self._without_friction(responses, common, frame)
             if self._friction_mm and not frame_firm:
-                frame = _frame(responses, common)
+                frame = _frame(responses, common, near=frame)
         chosen = [r for r, c in responses if c in common]
         if frame is not None:
             chosen = [frame.over_bed(response) for response in chosen]
@@ -436,10 +436,12 @@ class _AxisWork:
 
 
 def _frame(
-    responses: Sequence[tuple[FrequencyResponse, Condition]], common: Collection[Condition]
+    responses: Sequence[tuple[FrequencyResponse, Condition]],
+    common: Collection[Condition],
+    near: Frame | None = None,
 ) -> Frame | None:
     """Return the frame that shakes in raw logs, if one is seen."""
-    return frame_of(mean_response([r for r, c in responses if c in common]))
+    return frame_of(mean_response([r for r, c in responses if c in common]), near)
 
 
 def _axis(measurement: Measurement, settings: ReadSettings) -> Axis:

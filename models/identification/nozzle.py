@@ -87,11 +87,19 @@ class Frame:
         return replace(measured, response=measured.response * more, sd=measured.sd * np.abs(more))
 
 
-def frame_of(measured: FrequencyResponse) -> Frame | None:
-    """Return the frame that a response shows; None if there is none that is clear."""
+def frame_of(measured: FrequencyResponse, near: Frame | None = None) -> Frame | None:
+    """Return the frame that a response shows; None if there is none that is clear.
+
+    Parameters
+    ----------
+    measured : FrequencyResponse
+    near : Frame, optional
+        What the response showed before friction was removed from it: look for this one again.
+    """
     data = response_data(measured).thinned(_POINTS)
     held = _start(data)
-    tried = [_polished(data, held.on_its_feet(f_hz)) for f_hz in _STARTS_HZ]
+    starts = [Frame(f_hz, *_START) for f_hz in _STARTS_HZ] if near is None else [near]
+    tried = [_polished(data, held.on_its_feet(frame)) for frame in starts]
     found = min(tried, key=lambda one: one.cost)
     frame = found.frame
     main_hz = float(data.f_hz[np.argmax(np.abs(data.response))])
@@ -117,10 +125,10 @@ class _Found:
         (f, zeta), mu = np.exp(self.vector[2:4]), self.vector[4]
         return Frame(float(f), float(zeta), float(mu), float(np.exp(self.vector[0])))
 
-    def on_its_feet(self, f_hz: float) -> _Found:
-        """Return the same with a frame resonance at this frequency."""
-        frame = [np.log(f_hz), np.log(_START[0]), _START[1]]
-        vector = np.concatenate([self.vector[:2], frame, self.vector[2:]])
+    def on_its_feet(self, frame: Frame) -> _Found:
+        """Return the same with this frame."""
+        shaking = [np.log(frame.f_hz), np.log(frame.zeta), frame.mass_ratio]
+        vector = np.concatenate([self.vector[:2], shaking, self.vector[2:]])
         return replace(self, vector=vector, shaken=True)
 
     def model_and_gradient(self, f_hz: Array) -> tuple[ComplexArray, ComplexArray]:
