@@ -17,7 +17,13 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from sqlalchemy import Connection, Engine, create_engine, event, func, inspect, select, text
 from sqlalchemy.engine import URL, make_url
-from sqlalchemy.exc import ArgumentError, DBAPIError, InterfaceError, OperationalError
+from sqlalchemy.exc import (
+    ArgumentError,
+    DatabaseError,
+    DBAPIError,
+    InterfaceError,
+    OperationalError,
+)
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 from sqlalchemy.pool import NullPool
 
@@ -358,6 +364,13 @@ def _translate_errors(engine: Engine) -> Iterator[None]:
         raise DatabaseAway(
             f"the database {_shown(engine)} does not answer: {_reason(error)}; see whether it runs "
             "and has space left"
+        ) from error
+    except DatabaseError as error:
+        if type(error) is not DatabaseError:
+            raise  # a bug of ours
+        raise DatabaseAway(
+            f"the database {_shown(engine)} is damaged: {_reason(error)}; stop the service and "
+            "restore a backup"
         ) from error
 
 

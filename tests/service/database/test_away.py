@@ -54,6 +54,18 @@ def test_postgresql_comes_back(server: PostgresServer, tmp_path: Path, how: sign
     engine.dispose()
 
 
+def test_sqlite_that_is_damaged(tmp_path: Path):
+    engine = open_database(Settings(data_dir=tmp_path))
+    store = JobStore(engine)
+    job = store.add(make_job())
+    engine.dispose()  # its pages go from the log to the file
+    file = tmp_path / "stillpath.sqlite3"
+    file.write_bytes(b"rubbish " * (file.stat().st_size // 8))
+    with pytest.raises(DatabaseAway, match=r"is damaged: .*restore a backup"):
+        store.get(job.id)
+    engine.dispose()
+
+
 def test_sqlite_kept_by_somebody_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(database, "_BUSY_TIMEOUT_MS", 50)
     engine = open_database(Settings(data_dir=tmp_path))
