@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import signal
 import sqlite3
+import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -63,6 +64,25 @@ def test_sqlite_that_is_damaged(tmp_path: Path):
     file.write_bytes(b"rubbish " * (file.stat().st_size // 8))
     with pytest.raises(DatabaseAway, match=r"is damaged: .*restore a backup"):
         store.get(job.id)
+    engine.dispose()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="open files stay there")
+@pytest.mark.parametrize("replaced", [False, True])
+def test_sqlite_that_is_deleted_while_it_is_open_accepts_nothing(tmp_path: Path, replaced: bool):
+    engine = open_database(Settings(data_dir=tmp_path))
+    store = JobStore(engine)
+    store.add(make_job())
+    file = tmp_path / "stillpath.sqlite3"
+    if replaced:
+        shutil.copy(file, tmp_path / "copy")
+        (tmp_path / "copy").replace(file)
+    else:
+        file.unlink()
+    with pytest.raises(DatabaseAway, match="deleted or replaced while the service ran"):
+        store.add(make_job())
+    with pytest.raises(DatabaseAway, match="deleted or replaced while the service ran"):
+        store.counts()
     engine.dispose()
 
 
