@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import logging
 import sys
 from typing import TextIO, cast
 
@@ -30,6 +32,18 @@ def configure_logging() -> None:
         ],
         logger_factory=structlog.WriteLoggerFactory(file=cast("TextIO", _Stderr())),
     )
+    logging.basicConfig(handlers=[_Forward()], level=logging.WARNING)
+
+
+class _Forward(logging.Handler):
+    """Passes what libraries log on, so that it looks like everything else."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        error = record.exc_info[1] if record.exc_info else None
+        if isinstance(error, asyncio.CancelledError):
+            return  # a request that was in progress when the service stopped
+        told = structlog.get_logger(record.name)
+        told.log(record.levelno, record.getMessage(), exc_info=error)
 
 
 class _Stderr:

@@ -65,6 +65,7 @@ def serve_forever(
         app,
         host=host,
         port=port,
+        log_config=None,  # as all libraries': `service.logs`
         log_level="warning",
         access_log=False,
         server_header=False,

@@ -100,8 +100,8 @@ def age_warnings(machine: Machine, now: datetime, max_age_days: float) -> list[s
             found.append(f"{start}: its measurement has no date; measure it again")
         elif (age := (now.date() - known.measured_on).days) > max_age_days:
             found.append(
-                f"{start}: measured on {known.measured_on}, {age} days ago (limit "
-                f"{max_age_days:g}, STILLPATH_MEASUREMENT_MAX_AGE_DAYS); measure it again"
+                f"{start}: measured on {known.measured_on}, {age} days ago, more than "
+                f"{max_age_days:g}; measure it again"
             )
     return found
 

@@ -52,7 +52,9 @@ _SETTINGS = ("server", "key", "machine", "method", "reports", "log", "on_error",
 _PRINTER_NAMES = ("PHYSICAL_PRINTER_SETTINGS_ID", "PRINTER_SETTINGS_ID", "PRINTER_MODEL")
 _SUFFIXES = (".gcode.3mf", ".gcode", ".bgcode", ".gco", ".g")
 _FOLDER = "stillpath-post-"
-_LEFT_S = 7 * 86400.0  # nobody waits for a file that long
+_PART = ".stillpath.part"
+# Nobody waits for a file that long, and copying one takes seconds.
+_FOLDER_LEFT_S, _PART_LEFT_S = 7 * 86400.0, 3600.0
 _SHOWN_EVERY_S, _SAID_EVERY_S = 0.1, 5.0  # on a terminal, elsewhere
 
 
@@ -158,7 +160,7 @@ def _on_server(path: Path, options: dict[str, Any], settings: Settings, voice: V
     before = path.stat()
     client = Service(settings.server, settings.key, settings.timeout, voice.progress)
     # Who is killed while he waits or fetches leaves nothing beside the file.
-    _delete_leftovers()
+    _delete_leftovers(Path(tempfile.gettempdir()), f"{_FOLDER}*", _FOLDER_LEFT_S)
     with tempfile.TemporaryDirectory(prefix=_FOLDER) as folder:
         fetched = Path(folder) / "result"
         page = client.compensate(path, fetched, options, settings.wait)
@@ -170,12 +172,15 @@ def _on_server(path: Path, options: dict[str, Any], settings: Settings, voice: V
     return page
 
 
-def _delete_leftovers() -> None:
-    """Delete the temporary folders of runs that were killed."""
-    for left in Path(tempfile.gettempdir()).glob(f"{_FOLDER}*"):
+def _delete_leftovers(folder: Path, pattern: str, left_s: float) -> None:
+    """Delete what runs that were killed have left: temporary folders, and files beside prints."""
+    for left in folder.glob(pattern):
         with contextlib.suppress(OSError):
-            if time.time() - left.lstat().st_mtime > _LEFT_S:
-                shutil.rmtree(str(left))
+            if time.time() - left.lstat().st_mtime > left_s:
+                if left.is_dir():
+                    shutil.rmtree(str(left))
+                else:
+                    left.unlink()
 
 
 def _write_report(page: bytes, job: PrintJob, settings: Settings, voice: Voice) -> None:
@@ -194,7 +199,8 @@ def _write_report(page: bytes, job: PrintJob, settings: Settings, voice: Voice) 
 def replacing(target: Path) -> Iterator[Path]:
     """Yield a temporary file beside `target` that takes its place when the block ends well."""
     prefix = f".{target.name[:40]}."  # a name may be as long as names can be
-    handle, name = tempfile.mkstemp(prefix=prefix, suffix=".part", dir=target.parent)
+    _delete_leftovers(target.parent, f".*{_PART}", _PART_LEFT_S)
+    handle, name = tempfile.mkstemp(prefix=prefix, suffix=_PART, dir=target.parent)
     os.close(handle)
     temporary = Path(name)
     try:

@@ -13,7 +13,7 @@ from starlette.responses import Response, StreamingResponse
 from stillpath.service.api.problems import Problem
 from stillpath.service.storage.base import Storage
 
-__all__ = ["HEADERS", "MEDIA", "RANGES", "matches", "stored"]
+__all__ = ["HEADERS", "MEDIA", "RANGES", "damaged", "matches", "stored"]
 
 _RANGE = re.compile(r"bytes=(\d{1,18})?-(\d{1,18})?")
 
@@ -42,6 +42,7 @@ async def stored(
     etag: str | None = None,
     filename: str | None = None,
     span: tuple[int, int] | None = None,
+    size_bytes: int | None = None,
 ) -> Response:
     """Return the answer with a stored file.
 
@@ -59,20 +60,25 @@ async def stored(
         Under which a browser saves it.
     span : (int, int), optional
         First byte, and the one after the last, of what counts as the file.
+    size_bytes : int, optional
+        Size that the file was stored with.
 
     Raises
     ------
     Problem
-        404 if the file is gone, 416 if it has no such range.
+        404 if the file is gone or damaged, 416 if it has no such range.
     """
     try:
         found = await run_in_threadpool(storage.stat, key)
     except FileNotFoundError:
         name = key.rsplit("/", 1)[-1]
-        raise Problem(404, "The file is gone", f"{name} is no longer in the storage.") from None
+        detail = f"{name} is no longer in the storage. Submit the job again."
+        raise Problem(404, "The file is gone", detail) from None
+    if size_bytes not in (None, found.size_bytes):
+        raise damaged(key, f"{found.size_bytes} bytes instead of {size_bytes}")
     first, past = span or (0, found.size_bytes)
     if not 0 <= first <= past <= found.size_bytes:
-        raise Problem(404, "The file is gone", "The file is shorter than its index says.")
+        raise damaged(key, f"{found.size_bytes} bytes, and its index goes up to {past}")
     tag = f'"{etag or f"{found.size_bytes:x}-{int(found.modified_at * 1e6):x}"}"'
     headers = {"ETag": tag, "Accept-Ranges": "bytes"}
     if filename is not None:
@@ -92,6 +98,12 @@ async def stored(
         return Response(status_code=status, headers=headers, media_type=media_type)
     chunks = _closing(storage.read(key, first, past))
     return StreamingResponse(chunks, status_code=status, headers=headers, media_type=media_type)
+
+
+def damaged(key: str, what: str) -> Problem:
+    """Return the problem of a file in the storage that is not what was stored; `what` it has."""
+    detail = f"{key} in the storage has {what}. Check the storage's disk, and submit the job again."
+    return Problem(404, "The file is damaged", detail)
 
 
 def matches(header: str | None, tag: str) -> bool:

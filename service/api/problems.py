@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 from collections.abc import Mapping
 from http import HTTPStatus
@@ -16,7 +17,7 @@ from starlette.responses import Response
 from starlette.routing import Match
 
 from stillpath.models.complaints import complaint
-from stillpath.service.database.engine import DatabaseAway
+from stillpath.service.database.engine import DatabaseAway, DatabaseFull
 from stillpath.service.jobs.problems import PROBLEM_MEDIA_TYPE, problem
 from stillpath.service.storage.base import StorageError
 from stillpath.service.storage.disk import DISK_FULL, NoRoom
@@ -28,6 +29,8 @@ NO_KEY = (
     "'X-Api-Key: sp_...'; `stillpath keys create` makes one."
 )
 
+_UNWRITABLE = (errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO)
+"""Error numbers of a disk that was made read-only, given to somebody else, or is broken."""
 _METHODS = ("DELETE", "GET", "HEAD", "PATCH", "POST", "PUT")
 
 
@@ -103,6 +106,10 @@ def install(app: FastAPI) -> None:
     async def _no_database(request: Request, error: DatabaseAway) -> Response:
         return _away(request, "Database unavailable", "The database does not answer", error)
 
+    @app.exception_handler(DatabaseFull)
+    async def _full_database(request: Request, error: DatabaseFull) -> Response:
+        return _full(request, error)
+
     @app.exception_handler(StorageError)
     async def _no_storage(request: Request, error: StorageError) -> Response:
         if error.errno in DISK_FULL:
@@ -113,6 +120,8 @@ def install(app: FastAPI) -> None:
     async def _system(request: Request, error: OSError) -> Response:
         if error.errno in DISK_FULL:
             return _full(request, error)
+        if error.errno in _UNWRITABLE:
+            return _away(request, "Disk unavailable", "The data directory cannot be used", error)
         raise error
 
     @app.exception_handler(ClientDisconnect)
@@ -162,7 +171,7 @@ def _away(request: Request, title: str, what: str, error: Exception) -> Response
     return problem_response(problem(503, title, detail), {"Retry-After": "5"})
 
 
-def _full(request: Request, error: OSError) -> Response:
+def _full(request: Request, error: Exception) -> Response:
     structlog.get_logger("api").error("disk full", path=request.url.path, reason=str(error))
     detail = "The disk of the service is full. Delete old jobs, or make room on it."
     if isinstance(error, NoRoom):

@@ -14,7 +14,7 @@ from starlette.responses import Response
 
 from stillpath.gcode.containers.sniff import Kind, kind_of
 from stillpath.service.api.access import Reader
-from stillpath.service.api.file_responses import HEADERS, MEDIA, RANGES, stored
+from stillpath.service.api.file_responses import HEADERS, MEDIA, RANGES, damaged, stored
 from stillpath.service.api.job_lookup import JobId, find_done
 from stillpath.service.api.problems import Problem, responses
 from stillpath.service.api.schemas import LayerIndex
@@ -50,6 +50,8 @@ class Layers:
         ------
         FileNotFoundError
             If there are no layers.
+        Problem
+            If their list is damaged.
         """
         with self._lock:
             if output in self._kept:
@@ -57,8 +59,11 @@ class Layers:
                 return self._kept[output]
         key = f"{output}/report/layers.json"
         text = b"".join(self._storage.read(key, 0, self._storage.stat(key).size_bytes))
-        layers = json.loads(text)["layers"]
-        spans = [(layer["offset"], layer["offset"] + layer["bytes"]) for layer in layers]
+        try:
+            layers = json.loads(text)["layers"]
+            spans = [(layer["offset"], layer["offset"] + layer["bytes"]) for layer in layers]
+        except (ValueError, KeyError, TypeError):
+            raise damaged(key, "no list of layers") from None
         with self._lock:
             self._kept[output] = spans
             while len(self._kept) > _KEPT:
@@ -106,6 +111,7 @@ async def read_result(request: Request, job_id: JobId, caller: Reader) -> Respon
         media_type=media_type,
         etag=job.result_sha256,
         filename=job.result_name,
+        size_bytes=job.result_bytes,
     )
 
 

@@ -374,8 +374,9 @@ class Health(BaseModel):
 
 
 def _stage(job: Job) -> str:
-    if job.waits_for_room and job.room_bytes:
-        return f"{job.stage}: more than {job.room_bytes >> 20} MiB are needed"
+    needed_mib = (job.room_bytes or 0) >> 20
+    if job.waits_for_room and needed_mib:
+        return f"{job.stage}: more than {needed_mib} MiB are needed"
     return job.stage
 
 

@@ -17,7 +17,13 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from sqlalchemy import Connection, Engine, create_engine, event, func, inspect, select, text
 from sqlalchemy.engine import URL, make_url
-from sqlalchemy.exc import ArgumentError, DBAPIError, InterfaceError, OperationalError
+from sqlalchemy.exc import (
+    ArgumentError,
+    DatabaseError,
+    DBAPIError,
+    InterfaceError,
+    OperationalError,
+)
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 from sqlalchemy.pool import NullPool
 
@@ -33,6 +39,7 @@ _T = TypeVar("_T")
 
 __all__ = [
     "DatabaseAway",
+    "DatabaseFull",
     "StoreError",
     "database_url",
     "insert",
@@ -47,6 +54,7 @@ __all__ = [
 _FILE = "stillpath.sqlite3"
 _BUSY_TIMEOUT_MS = 30_000
 _AGAIN_S = 0.02
+_OPENED = "stillpath_opened"
 _WRITER = threading.Lock()
 _WRITE_QUEUE: deque[_PendingWrite] = deque()
 """Pending writes of `write_together`."""
@@ -70,6 +78,10 @@ class StoreError(RuntimeError):
 
 class DatabaseAway(StoreError):
     """The database does not respond, or not in time; a retry may help."""
+
+
+class DatabaseFull(DatabaseAway):
+    """There is no space for the database to write."""
 
 
 def database_url(settings: Settings) -> URL:
@@ -355,18 +367,42 @@ def _translate_errors(engine: Engine) -> Iterator[None]:
     try:
         yield
     except (OperationalError, InterfaceError, PoolTimeout) as error:
+        if getattr(getattr(error, "orig", None), "sqlite_errorcode", None) == sqlite3.SQLITE_FULL:
+            raise DatabaseFull(
+                f"the disk of the database {_shown(engine)} is full; make room on it"
+            ) from error
         raise DatabaseAway(
             f"the database {_shown(engine)} does not answer: {_reason(error)}; see whether it runs "
             "and has space left"
         ) from error
+    except DatabaseError as error:
+        if type(error) is not DatabaseError:
+            raise  # a bug of ours
+        raise DatabaseAway(
+            f"the database {_shown(engine)} is damaged: {_reason(error)}; stop the service and "
+            "restore a backup"
+        ) from error
 
 
-def _prepare_sqlite(connection: Any, _: Any) -> None:
+def _prepare_sqlite(connection: Any, record: Any) -> None:
     connection.isolation_level = None  # BEGIN is ours, below
     connection.execute(f"PRAGMA busy_timeout = {_BUSY_TIMEOUT_MS}").close()
     _use_write_ahead_log(connection)
     for pragma in ("synchronous = FULL", "foreign_keys = ON"):
         connection.execute(f"PRAGMA {pragma}").close()
+    _, _, name = connection.execute("PRAGMA database_list").fetchone()
+    record.info[_OPENED] = name, _identity(name)
+
+
+def _identity(name: str) -> tuple[int, int] | None:
+    """Return which file has a name now; None if none has, or the database is in memory."""
+    if not name:
+        return None
+    try:
+        status = Path(name).stat()
+    except FileNotFoundError:
+        return None
+    return status.st_dev, status.st_ino
 
 
 def _use_write_ahead_log(connection: Any) -> None:
@@ -387,6 +423,13 @@ def _use_write_ahead_log(connection: Any) -> None:
 def _begin_sqlite(connection: Connection) -> None:
     # A transaction that read first and then wants to write fails at once if somebody else wrote
     # meanwhile; one that says so at its beginning waits for its turn.
+    name, opened = connection.info[_OPENED]
+    if _identity(name) != opened:
+        # SQLite would go on in the deleted file, and what is accepted there is lost.
+        raise DatabaseAway(
+            f"the database {_shown(connection.engine)} was deleted or replaced while the service "
+            "ran; put it back if need be, and start the service again"
+        )
     is_reading = connection.get_execution_options().get("stillpath_reading", False)
     connection.exec_driver_sql("BEGIN" if is_reading else "BEGIN IMMEDIATE")
 

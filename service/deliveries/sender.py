@@ -28,7 +28,7 @@ from stillpath.service.deliveries.webhooks import send_webhook
 from stillpath.service.jobs.state import Job
 from stillpath.service.jobs.store import JobStore
 from stillpath.service.settings import Settings
-from stillpath.service.storage.base import Storage, StorageError
+from stillpath.service.storage.base import Storage, StorageError, sha256_of
 
 __all__ = ["Sender", "SendingTimes"]
 
@@ -262,9 +262,11 @@ class Sender:
         # The age is unknown where a clock was set back.
         late = abs(time.time() - (job.finished_at or 0.0)) > self._times.start_within_s
         starts = job.print_after and not unsafe and not late
-        copy = contextlib.ExitStack()
-        file = copy.enter_context(self._storage.local(f"{job.output}/result/{job.result_name}"))
-        with _once(starts, job), copy:
+        with contextlib.ExitStack() as copy:
+            file = copy.enter_context(self._storage.local(job.result))
+            if sha256_of(file) != job.result_sha256:
+                return "failed", "the result in the storage is damaged; submit the file again"
+            copy.enter_context(_once(starts, job))
             reply = upload(printer, file, job.result_name, sha256=job.result_sha256, start=starts)
             state, error = _judged(reply)
             begun = what_started(printer, reply) if starts else None

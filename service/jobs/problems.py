@@ -10,6 +10,7 @@ from stillpath.service.storage.disk import DISK_FULL
 
 __all__ = [
     "PROBLEM_MEDIA_TYPE",
+    "input_damaged",
     "input_gone",
     "never_fits",
     "problem",
@@ -99,7 +100,18 @@ def problem_of(error: BaseException, kind: JobKind = JobKind.COMPENSATION) -> di
 
 def input_gone(name: str) -> dict[str, Any]:
     """Return the problem of a job whose input was deleted; `name` of the file."""
-    return problem(404, "The file is gone", f"{name} is no longer in the storage.")
+    detail = f"{name} is no longer in the storage. Submit it again."
+    return problem(404, "The file is gone", detail)
+
+
+def input_damaged(name: str) -> dict[str, Any]:
+    """Return the problem of a job whose input is not what was submitted; `name` of the file."""
+    return problem(
+        404,
+        "The file is damaged",
+        f"{name} in the storage is not the file that was submitted: its SHA-256 differs. Check the "
+        "disk of the storage, and submit the file again.",
+    )
 
 
 def never_fits(room_bytes: int, total_bytes: int) -> dict[str, Any]:

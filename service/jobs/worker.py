@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import functools
-import hashlib
 import json
 import os
 import pkgutil
@@ -29,6 +28,7 @@ from stillpath.service.database.engine import DatabaseAway, StoreError, open_dat
 from stillpath.service.environment import prepare_environment
 from stillpath.service.jobs.computations import run_computation
 from stillpath.service.jobs.problems import (
+    input_damaged,
     input_gone,
     never_fits,
     problem_of,
@@ -42,7 +42,7 @@ from stillpath.service.jobs.watch import Limits, Watch, held_bytes
 from stillpath.service.logs import configure_logging
 from stillpath.service.processes import limit_memory
 from stillpath.service.settings import Settings
-from stillpath.service.storage import Storage, StorageError
+from stillpath.service.storage import Storage, StorageError, sha256_of
 from stillpath.service.storage.disk import DISK_FULL, Disk
 from stillpath.service.storage.factory import open_storage
 
@@ -58,8 +58,12 @@ _MOST_KEPT_BYTES = 512 << 20
 _Given = TypeVar("_Given")
 
 
-class _InputGone(Exception):
-    """A job's input is no longer in the storage; the message is its name."""
+class _InputBroken(Exception):
+    """A job's input is gone from the storage or damaged."""
+
+    def __init__(self, found: dict[str, Any]) -> None:
+        super().__init__(found["detail"])
+        self.problem = found
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,8 +216,8 @@ def _attempt(
     except MemoryError:
         what = "The system refused its process more memory"
         return Failed(job.attempt, time.time(), limits.too_large(what))
-    except _InputGone as error:
-        return Failed(job.attempt, time.time(), input_gone(str(error)))
+    except _InputBroken as error:
+        return Failed(job.attempt, time.time(), error.problem)
     except OSError as error:
         if error.errno in DISK_FULL:
             return NoRoom(job.attempt, time.time())  # not even for its folder
@@ -286,7 +290,10 @@ def _work(job: Job, workplace: Workplace, runner: Runner, watch: Watch, folder: 
         try:
             sources = tuple(fetch(key) for key in job.sources)
         except FileNotFoundError:
-            raise _InputGone(job.source_name) from None
+            raise _InputBroken(input_gone(job.source_name)) from None
+        # What a disk has cut or garbled may still look like G-code: half a print.
+        if sources and sha256_of(sources[0]) != job.source_sha256:
+            raise _InputBroken(input_damaged(job.source_name))
         try:
             machine = fetch(job.machine_file)
         except FileNotFoundError:
@@ -307,8 +314,7 @@ def _work(job: Job, workplace: Workplace, runner: Runner, watch: Watch, folder: 
             ),
             watch.tell,
         )
-    with target.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    digest = sha256_of(target)
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     result_bytes = target.stat().st_size
     output, output_bytes = job.attempt_files, sum(path.stat().st_size for path in files)

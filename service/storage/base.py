@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-__all__ = ["Room", "Stat", "Storage", "StorageError"]
+__all__ = ["Room", "Stat", "Storage", "StorageError", "sha256_of"]
 
 
 class StorageError(OSError):
@@ -43,6 +44,12 @@ class Room:
 
     free_bytes: int
     total_bytes: int
+
+
+def sha256_of(file: Path) -> str:
+    """Return the SHA-256 of a file, as the rows of jobs hold it."""
+    with file.open("rb") as opened:
+        return hashlib.file_digest(opened, "sha256").hexdigest()
 
 
 class Storage(Protocol):

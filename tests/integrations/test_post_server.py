@@ -218,9 +218,14 @@ def test_what_a_killed_run_left_is_deleted(running: Running, part: Path, tmp_pat
         (folder / name / "result").write_bytes(b"G1 X1")
         at = time.time() - days * 86400
         os.utime(folder / name, (at, at))
+    kept, left = (part.with_name(f".{part.name}.{n}.stillpath.part") for n in "ab")
+    for path, hours in ((kept, 0.5), (left, 2)):
+        path.write_bytes(b"G1")
+        os.utime(path, (time.time() - hours * 3600,) * 2)
     done = post(*running.arguments, part, home=tmp_path, TMPDIR=str(folder))
     assert done.returncode == 0, done.stderr
     assert sorted(path.name for path in folder.iterdir()) == ["other", "stillpath-post-new"]
+    assert (kept.exists(), left.exists()) == (True, False)
 
 
 def test_a_full_disk(running: Running, part: Path, tmp_path: Path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -99,18 +100,16 @@ def test_an_upload_goes_to_disk_and_not_into_memory(tmp_path: Path, form: bool):
 @pytest.mark.slow
 def test_a_killed_server_finishes_its_jobs_after_the_next_start(tmp_path: Path):
     with server(PRETEND, tmp_path) as (client, process):
-        running = post(client, b"slow")
+        running = post(client, b"slow-once")
         waiting = post(client, b"G1 X1")
         until(lambda: client.get(running).json()["state"] == "running")
         process.kill()
         process.wait()
-    source = tmp_path / "jobs" / running.rsplit("/", 1)[1] / "source" / "upload.gcode"
-    source.write_text("G1 X2\n")
     with server(PRETEND, tmp_path) as (client, _):
         assert finished(client, running)["state"] == "done"
         assert finished(client, waiting)["state"] == "done"
         result = client.get(f"{running}/result")
-        assert result.text == "; compensated\nG1 X2\n"
+        assert result.text == "; compensated\nslow-once"
 
 
 @pytest.mark.slow
@@ -131,6 +130,36 @@ def test_logs_are_json_whatever_is_killed(tmp_path: Path):
     assert len(lines) > 5
     assert all("event" in json.loads(line) for line in lines)
     assert "Traceback" not in log.read_text()
+
+
+@pytest.mark.slow
+def test_a_download_that_stalls_does_not_keep_a_server_from_its_end(tmp_path: Path):
+    log, data = tmp_path / "log", tmp_path / "data"
+    data.mkdir()
+    with server(PRETEND, data, log=log) as (client, process):
+        where = post(client, b"long 20")
+        assert finished(client, where)["state"] == "done"
+        with client.stream("GET", f"{where}/result") as answer:
+            next(answer.iter_raw())
+            process.send_signal(signal.SIGTERM)
+            process.wait(timeout=60)
+    lines = [json.loads(line) for line in log.read_text().splitlines()]
+    assert not any("exception" in line for line in lines)
+
+
+@pytest.mark.slow
+def test_a_deleted_data_directory_is_told_and_nothing_is_accepted(tmp_path: Path):
+    data = tmp_path / "data"
+    data.mkdir()
+    with server(PRETEND, data) as (client, _):
+        shutil.rmtree(data, ignore_errors=True)
+        for answer in (
+            client.post("/v1/jobs?machine=ender3", content=b"G1"),
+            client.get("/v1/jobs"),
+        ):
+            assert answer.status_code == 503
+            assert answer.json()["title"] == "Database unavailable"
+        until(lambda: client.get("/readyz").json().get("part") == "database")
 
 
 @pytest.mark.slow

@@ -220,6 +220,11 @@ def test_a_job_that_is_not_there(visitor: Visitor):
     expect(page.locator("h1")).to_have_text("No such page")
     page.goto(f"{visitor.url}/#/jobs/{'0' * 32}")
     expect(page.get_by_role("alert")).to_contain_text("no job")
+    page.get_by_role("link", name="All jobs").click()
+    expect(page.locator("h1")).to_have_text("Jobs")
+    page.goto(f"{visitor.url}/#/machines/nobody")
+    page.get_by_role("link", name="All machines").click()
+    expect(page.locator("h1")).to_have_text("Machines")
 
 
 @pytest.fixture(scope="module")

@@ -51,7 +51,9 @@ export function startRouter(main, routes) {
     } catch (error) {
       if (isAbort(error) || here.signal.aborted) return;
       main.querySelector(":scope > .late")?.remove();
-      main.append(problemPanel(error, h("button", { type: "button", onclick: show }, "Try again")));
+      const actions = [h("button", { type: "button", onclick: show }, "Try again")];
+      if (route !== undefined && path.startsWith(`/${route.name}/`)) actions.push(h("a.button", { href: `#/${route.name}` }, `All ${route.name}`));
+      main.append(problemPanel(error, ...actions));
     }
     if (!first && !here.signal.aborted) focusHeading(main);
     first = false;

@@ -163,3 +163,22 @@ def test_a_job_too_large_for_the_disk_is_told_so(
         foreign.unlink()
         until(lambda: client.get(where).json()["state"] == "done", 90)
         assert client.get(where).json()["room_bytes"] is None
+
+
+@pytest.mark.slow
+def test_a_database_without_room_says_so_where_nothing_is_reserved(
+    small_disk: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("STILLPATH_DISK_RESERVE_BYTES", "0")
+    data = small_disk / "data"
+    data.mkdir()
+    foreign = small_disk / "foreign"
+    with server(PRETEND, data) as (client, _):
+        where = handed_in(client, b"G1 X1").headers["location"]
+        until(lambda: client.get(where).json()["state"] == "done", 60)
+        fill(foreign)
+        answer = client.delete(where)
+        assert (answer.status_code, answer.json()["title"]) == (507, "No space left")
+        assert client.get(f"{where}/result").status_code == 200
+        foreign.unlink()
+        assert client.delete(where).status_code == 204

@@ -100,6 +100,17 @@ def test_what_is_gone_is_told(client: TestClient, data_dir: Path):
     assert_problem(client.get(f"{where}/layers/0"), 404, "0 layers")
 
 
+def test_what_is_damaged_is_told(client: TestClient, data_dir: Path):
+    where = post(client, b"G1 X178").headers["location"]
+    done = until(client, where, over)
+    folder = next((data_dir / "jobs" / done["id"]).glob("1"))
+    (result,) = (folder / "result").iterdir()
+    result.write_bytes(result.read_bytes()[:5])
+    assert_problem(client.get(f"{where}/result"), 404, "5 bytes instead of 21")
+    (folder / "report" / "layers.json").write_text('{"layers": [{"off')
+    assert_problem(client.get(f"{where}/layers/0"), 404, "no list of layers")
+
+
 def test_the_schema_of_the_report(client: TestClient):
     schema = client.get("/v1/schemas/report.json").json()
     assert "properties" in schema

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import shutil
 import signal
 import sqlite3
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -42,6 +44,37 @@ def test_postgresql_comes_back(server: PostgresServer, tmp_path: Path, how: sign
     assert store.beat(job.id, 1, 1502.0, "reading", 0.5, None)
     assert store.apply(job.id, finished(running)) is not None
     assert store.counts()[JobState.DONE] == 1
+    engine.dispose()
+
+
+def test_sqlite_that_is_damaged(tmp_path: Path):
+    engine = open_database(Settings(data_dir=tmp_path))
+    store = JobStore(engine)
+    job = store.add(make_job())
+    engine.dispose()  # its pages go from the log to the file
+    file = tmp_path / "stillpath.sqlite3"
+    file.write_bytes(b"rubbish " * (file.stat().st_size // 8))
+    with pytest.raises(DatabaseAway, match=r"is damaged: .*restore a backup"):
+        store.get(job.id)
+    engine.dispose()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="open files stay there")
+@pytest.mark.parametrize("replaced", [False, True])
+def test_sqlite_that_is_deleted_while_it_is_open_accepts_nothing(tmp_path: Path, replaced: bool):
+    engine = open_database(Settings(data_dir=tmp_path))
+    store = JobStore(engine)
+    store.add(make_job())
+    file = tmp_path / "stillpath.sqlite3"
+    if replaced:
+        shutil.copy(file, tmp_path / "copy")
+        (tmp_path / "copy").replace(file)
+    else:
+        file.unlink()
+    with pytest.raises(DatabaseAway, match="deleted or replaced while the service ran"):
+        store.add(make_job())
+    with pytest.raises(DatabaseAway, match="deleted or replaced while the service ran"):
+        store.counts()
     engine.dispose()
 
 

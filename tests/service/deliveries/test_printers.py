@@ -71,6 +71,21 @@ def test_octoprint_gets_it_below_a_prefix(tmp_path: Path, prints: bool):
     assert (parts["print"][1], parts["select"][1]) == (word, word)
 
 
+@pytest.mark.parametrize("kind", ["moonraker", "octoprint"])
+def test_a_result_that_the_disk_has_damaged_goes_to_no_printer(tmp_path: Path, kind: str):
+    with (
+        (moonraker if kind == "moonraker" else octoprint)(key="k") as server,
+        at(tmp_path, printer("p", kind, server.url, api_key="k", start=True)) as place,
+    ):
+        job = place.finish(tmp_path, printer="p", print_after=True)
+        (place.settings.data_dir / job.result).write_bytes(RESULT[:-7])
+        with place.sending():
+            delivery = place.settled(job)
+    assert delivery.state == "failed"
+    assert "damaged; submit the file again" in (delivery.error or "")
+    assert not uploads(server)
+
+
 def test_a_failed_job_goes_to_no_printer(tmp_path: Path):
     with moonraker() as server, at(tmp_path, printer("m", "moonraker", server.url)) as place:
         job = place.fail(printer="m")

@@ -58,11 +58,16 @@ class Site:
 
     def submit(self, text: str, **fields: Any) -> str:
         """Do what the API does: the file first, then the row."""
-        job = make_job(
-            created_at=time.time(), source_name="part.gcode", source_bytes=len(text), **fields
-        )
+        content = text.encode()
+        given = {
+            "created_at": time.time(),
+            "source_name": "part.gcode",
+            "source_bytes": len(content),
+            "source_sha256": hashlib.sha256(content).hexdigest(),
+        }
+        job = make_job(**(given | fields))
         upload = self.data_dir / f"upload-{job.id}"
-        upload.write_text(text)
+        upload.write_bytes(content)
         self.storage.put(f"jobs/{job.id}/source/part.gcode", upload)
         self.store.add(job)
         return job.id

@@ -91,6 +91,17 @@ def test_a_deleted_job_stops_the_work(site: Site):
     site.check_files()
 
 
+@pytest.mark.parametrize("content", ["G1 X1\nG1", "G1 X1\nG1 X3\n"], ids=["cut", "garbled"])
+def test_an_upload_that_the_disk_has_damaged_is_not_printed(site: Site, content: str):
+    job_id = site.submit("G1 X1\nG1 X2\n")
+    (site.data_dir / "jobs" / job_id / "source" / "part.gcode").write_text(content)
+    job = Bench(site).run(job_id)
+    assert (job.state, job.attempt) == (JobState.FAILED, 1)
+    assert job.problem["title"] == "The file is damaged"
+    assert "submit the file again" in job.problem["detail"]
+    site.check_files()
+
+
 def test_a_lost_job_stops_and_its_files_do_not_count(site: Site):
     job_id = site.submit("nap 1")
     lost = Lost(1, time.time(), "test", 2, blame=True)
