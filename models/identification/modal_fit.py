@@ -57,6 +57,8 @@ _START_ZETA, _BEYOND = 0.08, 1.3
 _START_POINTS = 160
 _GROSS = 0.5
 """Residual from which modes without their delay are another plant (chosen, not measured)."""
+_MOST_LATE_S = 0.5e-3
+"""Viscous guides make slow motion no later: twice a mode's damping over its frequency."""
 
 
 def fit_modes(
@@ -133,12 +135,14 @@ def _as_used(data: ResponseData, fit: Fit) -> Fit:
     """Return the fit with the residual of the plant that is made of it (`prompt`).
 
     Pairs may fit with a delay of many milliseconds. Without it, they are another plant. Modes
-    delay slow motion by their grounded damping only, so they count as fitted unless that is gross.
+    delay slow motion by their grounded damping only: they count as fitted unless that is more than
+    guides do, or the plant is grossly another one.
     """
     turned = np.exp(-2j * np.pi * data.f_hz * (fit.delay_s + delay_of(fit.spec)))
     model = fit.gain * turned * frequency_response(prompt(fit), data.f_hz)
     missed = np.linalg.norm(model - data.response) / np.linalg.norm(data.response)
-    if isinstance(fit.spec, RelativeModesSpec) and missed <= _GROSS:
+    late = abs(delay_of(fit.spec)) > _MOST_LATE_S
+    if isinstance(fit.spec, RelativeModesSpec) and missed <= _GROSS and not late:
         return fit
     return replace(fit, residual=max(fit.residual, float(missed)))
 
