@@ -57,8 +57,9 @@ _START_ZETA, _BEYOND = 0.08, 1.3
 _START_POINTS = 160
 _GROSS = 0.5
 """Residual from which modes without their delay are another plant (chosen, not measured)."""
-_MOST_LATE_S = 0.5e-3
-"""Viscous guides make slow motion no later: twice a mode's damping over its frequency."""
+_LATE_S = (-0.5e-3, 1e-3)
+"""Delay of slow motion that modes may have: viscous guides make it as late as twice a mode's
+damping over its frequency, and nothing makes it early."""
 
 
 def fit_modes(
@@ -141,8 +142,8 @@ def _as_used(data: ResponseData, fit: Fit) -> Fit:
     turned = np.exp(-2j * np.pi * data.f_hz * (fit.delay_s + delay_of(fit.spec)))
     model = fit.gain * turned * frequency_response(prompt(fit), data.f_hz)
     missed = np.linalg.norm(model - data.response) / np.linalg.norm(data.response)
-    late = abs(delay_of(fit.spec)) > _MOST_LATE_S
-    if isinstance(fit.spec, RelativeModesSpec) and missed <= _GROSS and not late:
+    likely = missed <= _GROSS and _LATE_S[0] <= delay_of(fit.spec) <= _LATE_S[1]
+    if isinstance(fit.spec, RelativeModesSpec) and likely:
         return fit
     return replace(fit, residual=max(fit.residual, float(missed)))
 

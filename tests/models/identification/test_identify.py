@@ -25,7 +25,13 @@ from stillpath.models.identification.types import (
     Measurement,
     PlantModel,
 )
-from stillpath.models.plants import PairsSpec, PolePair, frequency_response
+from stillpath.models.plants import (
+    PairsSpec,
+    PolePair,
+    RelativeMode,
+    RelativeModesSpec,
+    frequency_response,
+)
 from stillpath.models.schedule import AxisSchedule, MassSchedule
 from tests.models.identification.recordings import (
     LEGACY,
@@ -543,3 +549,19 @@ def test_a_fit_misses_what_the_plant_without_its_delay_misses() -> None:
     used = fit.gain * np.abs(frequency_response(prompt(fit), f_hz))
     missed = np.linalg.norm(used - np.abs(g)) / np.linalg.norm(g)
     assert missed <= fit.residual
+
+
+def test_modes_whose_slow_motion_is_early_count_as_the_plant_they_are_used_as() -> None:
+    """Modes as strongly damped as these explain a phase, and are another plant on time."""
+    f_hz = np.arange(6.0, 132.0, 0.25)
+    modes = ((22.5, 0.06, 0.02), (75.2, 0.03, 0.95), (102.2, 0.69, 0.9), (104.2, 1.0, -0.87))
+    plant = RelativeModesSpec(
+        modes=tuple(
+            RelativeMode(f_hz=hz, zeta=zeta, share=share, grounded=1.0) for hz, zeta, share in modes
+        )
+    )
+    g = frequency_response(plant, f_hz)
+    fit = fit_modes(FrequencyResponse(f_hz, g, 0.002 * np.abs(g), np.ones(len(g))))
+    used = fit.gain * np.abs(frequency_response(prompt(fit), f_hz))
+    missed = np.linalg.norm(used - np.abs(g)) / np.linalg.norm(g)
+    assert missed < 0.025
