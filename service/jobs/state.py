@@ -379,5 +379,7 @@ def _lost_problem(job: Job, event: Lost) -> dict[str, Any]:
         "type": "about:blank",
         "title": "The worker was lost",
         "status": 500,
-        "detail": f"The job lost its worker {tries}: {event.reason}. The service's log says more.",
+        "detail": f"The job lost its worker {tries}: {event.reason}. Submit it again; if that does "
+        "not help, cut the print into several files, or give the computer more memory. The "
+        "service's log says more.",
     }
