@@ -92,6 +92,8 @@ class ComputeRequest:
         What JSON can hold.
     result_name : str
         File name of the answer.
+    source_sha256 : str
+        Of an input that is in the storage already.
     files : tuple of (Path, str)
         Input and its SHA-256; moved into the storage.
     """
@@ -104,6 +106,7 @@ class ComputeRequest:
     revision: str = ""
     source_name: str = ""
     source_bytes: int = 0
+    source_sha256: str = ""
     files: tuple[tuple[Path, str], ...] = field(default=())
 
     def job(self, owner: str) -> Job:
@@ -121,7 +124,7 @@ class ComputeRequest:
             dedupe_key=digest,
             source_name=self.source_name,
             source_bytes=self.source_bytes,
-            source_sha256=hashes[0] if hashes else "",
+            source_sha256=hashes[0] if hashes else self.source_sha256,
             result_name=self.result_name,
             created_at=time.time(),
         )

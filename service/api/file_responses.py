@@ -11,7 +11,7 @@ from starlette.concurrency import iterate_in_threadpool, run_in_threadpool
 from starlette.responses import Response, StreamingResponse
 
 from stillpath.service.api.problems import Problem
-from stillpath.service.storage.base import Storage
+from stillpath.service.storage.base import Stat, Storage
 
 __all__ = ["HEADERS", "MEDIA", "RANGES", "damaged", "matches", "stored"]
 
@@ -68,14 +68,7 @@ async def stored(
     Problem
         404 if the file is gone or damaged, 416 if it has no such range.
     """
-    try:
-        found = await run_in_threadpool(storage.stat, key)
-    except FileNotFoundError:
-        name = key.rsplit("/", 1)[-1]
-        detail = f"{name} is no longer in the storage. Submit the job again."
-        raise Problem(404, "The file is gone", detail) from None
-    if size_bytes not in (None, found.size_bytes):
-        raise damaged(key, f"{found.size_bytes} bytes instead of {size_bytes}")
+    found = await run_in_threadpool(_found, storage, key, size_bytes)
     first, past = span or (0, found.size_bytes)
     if not 0 <= first <= past <= found.size_bytes:
         raise damaged(key, f"{found.size_bytes} bytes, and its index goes up to {past}")
@@ -104,6 +97,18 @@ def damaged(key: str, what: str) -> Problem:
     """Return the problem of a file in the storage that is not what was stored; `what` it has."""
     detail = f"{key} in the storage has {what}. Check the storage's disk, and submit the job again."
     return Problem(404, "The file is damaged", detail)
+
+
+def _found(storage: Storage, key: str, size_bytes: int | None) -> Stat:
+    try:
+        found = storage.stat(key)
+    except FileNotFoundError:
+        name = key.rsplit("/", 1)[-1]
+        detail = f"{name} is no longer in the storage. Submit the job again."
+        raise Problem(404, "The file is gone", detail) from None
+    if size_bytes not in (None, found.size_bytes):
+        raise damaged(key, f"{found.size_bytes} bytes instead of {size_bytes}")
+    return found
 
 
 def matches(header: str | None, tag: str) -> bool:

@@ -18,7 +18,7 @@ from starlette.routing import Match
 
 from stillpath.models.complaints import complaint
 from stillpath.service.database.engine import DatabaseAway, DatabaseFull
-from stillpath.service.jobs.problems import PROBLEM_MEDIA_TYPE, problem
+from stillpath.service.jobs.problems import PROBLEM_MEDIA_TYPE, problem, problem_of
 from stillpath.service.storage.base import StorageError
 from stillpath.service.storage.disk import DISK_FULL, NoRoom
 
@@ -120,6 +120,8 @@ def install(app: FastAPI) -> None:
     async def _system(request: Request, error: OSError) -> Response:
         if error.errno in DISK_FULL:
             return _full(request, error)
+        if error.errno == errno.EFBIG:
+            return problem_response(problem_of(error), {"Connection": "close"})
         if error.errno in _UNWRITABLE:
             return _away(request, "Disk unavailable", "The data directory cannot be used", error)
         raise error

@@ -78,6 +78,7 @@ async def read_trajectories(
         },
         result_name=f"{Path(job.result_name).stem}.{format}",
         source_name=job.source_name,
+        source_sha256=job.source_sha256,
     )
     made = await run_and_wait(request, caller, asked)
     return await stored(

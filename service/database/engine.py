@@ -379,8 +379,8 @@ def _translate_errors(engine: Engine) -> Iterator[None]:
         if type(error) is not DatabaseError:
             raise  # a bug of ours
         raise DatabaseAway(
-            f"the database {_shown(engine)} is damaged: {_reason(error)}; stop the service and "
-            "restore a backup"
+            f"the database {_shown(engine)} cannot be read: {_reason(error)}; check "
+            "STILLPATH_DATABASE_URL and STILLPATH_DATA_DIR, or restore a backup"
         ) from error
 
 

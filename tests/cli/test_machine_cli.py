@@ -369,7 +369,7 @@ def test_the_age_of_a_measurement():
 
     assert warnings(180) == []
     (line,) = warnings(181)
-    assert line.startswith("axis x of mine: measured on 2026-05-24, 181 days ago (limit 180")
+    assert line.startswith("axis x of mine: measured on 2026-05-24, 181 days ago, more than 180;")
     assert warnings(181, 200.0) == []
 
 

@@ -75,9 +75,12 @@ def test_nothing_is_left_behind(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_upload_that_is_gone_is_told(client: TestClient, data_dir: Path):
+def test_an_upload_that_is_damaged_or_gone_is_told(client: TestClient, data_dir: Path):
     answer = client.post(f"{JOBS}&fresh=true&method=none", content=TEXT)
     job = until(client, answer.headers["location"], over)
     (source,) = (data_dir / "jobs" / job["id"] / "source").iterdir()
+    whole = source.read_bytes()
+    source.write_bytes(whole[: len(whole) // 2])
+    assert_problem(client.get(job["links"]["trajectories"]), 404, "SHA-256 differs")
     source.unlink()
     assert_problem(client.get(job["links"]["trajectories"]), 404, "no longer")

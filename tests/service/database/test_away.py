@@ -54,7 +54,7 @@ def test_sqlite_that_is_damaged(tmp_path: Path):
     engine.dispose()  # its pages go from the log to the file
     file = tmp_path / "stillpath.sqlite3"
     file.write_bytes(b"rubbish " * (file.stat().st_size // 8))
-    with pytest.raises(DatabaseAway, match=r"is damaged: .*restore a backup"):
+    with pytest.raises(DatabaseAway, match=r"cannot be read: .*restore a backup"):
         store.get(job.id)
     engine.dispose()
 

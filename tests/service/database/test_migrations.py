@@ -93,7 +93,7 @@ def test_a_newer_schema_is_refused(settings: Settings, engine: Engine):
 
 def test_what_is_no_database(tmp_path: Path):
     (tmp_path / "stillpath.sqlite3").write_bytes(b"G1 X1\n" * 999)
-    with pytest.raises(StoreError, match=r"stillpath\.sqlite3 cannot be opened: .*not a database"):
+    with pytest.raises(StoreError, match=r"stillpath\.sqlite3 cannot be read: .*not a database"):
         open_database(Settings(data_dir=tmp_path))
 
 
