@@ -292,8 +292,8 @@ def _missed_s(steps: list[tuple[float, float, float]]) -> float:
     # Wide limits: braking over several moves is no stream's, and not foreseen.
     limits = stream_limits(own, CommandLimits(accel_mm_s2=60_000.0, speed_step_mm_s=212.0))
     length, planned, turn = (np.array(column) for column in zip(*steps, strict=True))
-    # No faster than 200 mm/s, and not so slow that the least speed matters.
-    planned = np.clip(planned, length / 200.0, length / 2.0)
+    # Slow enough to stop in the last move, and not so slow that the least speed matters.
+    planned = np.clip(planned, length / 150.0, length / 2.0)
     angle = np.cumsum(turn)
     way = length[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     places = np.zeros((len(length) + 1, 4))
