@@ -26,6 +26,8 @@ Array = NDArray[np.float64]
 
 _ROUNDED_S = (4e-3, 8e-3, 16e-3)
 """Lengths of the smoothing window: around each place, the first that keeps the machine's limits."""
+_PASSES, _LAST_PASSES = 4, 50
+"""Of passing over to a longer window, and to no compensation of friction."""
 _BLEND_S = 0.01
 
 
@@ -83,8 +85,8 @@ class FrictionCompensator(Overlay):
         beyond = partial(self._bounds.beyond, wanted_mm=wanted)
         u = self._against(wanted, rests, _ROUNDED_S[0])
         for rounded_s in _ROUNDED_S[1:]:
-            u = eased(u, self._against(wanted, rests, rounded_s), beyond, self._dt_s)
-        u = eased(u, wanted, beyond, self._dt_s)
+            u = eased(u, self._against(wanted, rests, rounded_s), beyond, self._dt_s, _PASSES)
+        u = eased(u, wanted, beyond, self._dt_s, _LAST_PASSES)
         left = np.any(beyond(u), axis=1, keepdims=True)
         return np.where(left, wanted, u)
 

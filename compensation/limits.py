@@ -18,8 +18,6 @@ Mask = NDArray[np.bool_]
 _ROUNDED = 1.0 + 1e-9
 _REACH_S = 0.032
 """A command is replaced this far from a place beyond the limits, and partly twice as far."""
-_PASSES = 4
-"""The way over to a gentler command may exceed the limits too; then it begins earlier."""
 
 
 class CommandBounds:
@@ -66,9 +64,14 @@ _LIMITS = ("velocity_mm_s", "accel_mm_s2")
 """Of first and second differences."""
 
 
-def eased(u_mm: Array, gentler_mm: Array, beyond: Callable[[Array], Mask], dt_s: float) -> Array:
-    """Return a command (2, n) that passes over to a gentler one around places beyond the limits."""
-    for _ in range(_PASSES):
+def eased(
+    u_mm: Array, gentler_mm: Array, beyond: Callable[[Array], Mask], dt_s: float, passes: int
+) -> Array:
+    """Return a command (2, n) that passes over to a gentler one around places beyond the limits.
+
+    The way over may exceed the limits too; then it begins earlier, in the next of `passes`.
+    """
+    for _ in range(passes):
         over = beyond(u_mm)
         if not over.any():
             break

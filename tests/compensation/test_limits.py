@@ -57,7 +57,7 @@ def test_the_way_over_to_a_gentler_command_is_gentle() -> None:
     sharp = accelerating(500, 1100.0, 0.0)
     gentle = accelerating(500, 900.0, 0.0)
     beyond = partial(CommandBounds(machine(), DT_S).beyond, wanted_mm=STILL)
-    u = eased(sharp, gentle, beyond, DT_S)
+    u = eased(sharp, gentle, beyond, DT_S, 4)
     assert not beyond(u).any()
     np.testing.assert_allclose(u[:, 500:520], gentle[:, 500:520], atol=1e-12)
     np.testing.assert_array_equal(u[:, [0, -1]], sharp[:, [0, -1]])
