@@ -10,7 +10,8 @@ own linear part, which nobody has. Contour error while extruding.
     python benchmarks/closed_chain.py --printers 30 --from spectra
 
 Between measurement and print the printer may change: `--load-kg` lies on the bed of a bed slinger,
-`--belts` scales the stiffness of all belts.
+`--belts` scales the stiffness of all belts. `--friction` scales dry friction from the start: it is
+drawn for light guides, .02 to .3 N, and wheels or a heavy bed rub with 1 to 3 N.
 """
 
 from __future__ import annotations
@@ -96,6 +97,7 @@ class Task:
     firmware: str = "klipper"
     load_kg: float = 0.0
     belts: float = 1.0
+    friction: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,6 +166,7 @@ def main() -> int:
     parser.add_argument("--firmware", choices=("klipper", *OTHERS), default="klipper")
     parser.add_argument("--load-kg", type=float, default=0.0, help="on the bed, after measuring")
     parser.add_argument("--belts", type=float, default=1.0, help="stiffness after, over before")
+    parser.add_argument("--friction", type=float, default=1.0, help="of all guides, times as drawn")
     parser.add_argument("--oracle", action="store_true", help="tune shapers on the truth as well")
     parser.add_argument("--shared", type=Path, help="default: $STILLPATH_SHARED or ../shared")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
@@ -191,6 +194,7 @@ def main() -> int:
                 given.firmware,
                 given.load_kg,
                 given.belts,
+                given.friction,
             )
             for seed in range(given.first, given.first + given.printers)
             for kind in KINDS
@@ -238,7 +242,7 @@ def summary(rows: Sequence[Row], source: str) -> int:
 
 def judged(task: Task) -> list[Row]:
     """Measure, identify and print on one printer."""
-    printer = draw(task.kind, task.seed)
+    printer = rubbing(draw(task.kind, task.seed), task.friction)
     rng = np.random.default_rng([KINDS.index(task.kind), task.seed, 1])
     base = limited(load_machine(BASES[task.kind]), task.max_accel_mm_s2)
     if task.firmware != "klipper":
@@ -275,6 +279,13 @@ def judged(task: Task) -> list[Row]:
             )
         )
     return rows
+
+
+def rubbing(printer: Printer, times: float) -> Printer:
+    """Return the printer with guides that rub so many times as much."""
+    bodies = printer.bodies
+    frictions = tuple(replace(one, force_n=times * one.force_n) for one in bodies.frictions)
+    return replace(printer, bodies=replace(bodies, frictions=frictions))
 
 
 def changed(printer: Printer, load_kg: float, belts: float) -> Printer:

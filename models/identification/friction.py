@@ -28,7 +28,7 @@ from stillpath.models.identification.local_model import Transformed, local_respo
 from stillpath.models.identification.types import FrequencyResponse
 from stillpath.models.plants import MOST_FRICTION_MM
 
-__all__ = ["Friction", "dry_friction", "freed"]
+__all__ = ["Friction", "better_explained", "dry_friction", "freed"]
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -43,6 +43,8 @@ _LEAST_HZ = 4.0
 _TAPER = 0.01
 _CLEARLY = 0.01
 """Logarithm of the ratio of residuals with friction and without."""
+_ABOVE, _CLEARLY_STUCK = 1.1, 0.3
+"""Guides stick above the resonance, if the logarithm of the residual falls by this on average."""
 _APART = 0.5
 """Largest spread of repeats relative to their mean; beyond it, the cause is not friction."""
 
@@ -92,15 +94,39 @@ def dry_friction(
     return Friction(held_mm, float(_LATE_S[late]), motion) if clear and agree else Friction()
 
 
-def freed(aligned: AlignedLog, response: FrequencyResponse, friction: Friction) -> AlignedLog:
-    """Return the log with the start and the command corrected for friction."""
+def freed(
+    aligned: AlignedLog, response: FrequencyResponse, friction: Friction
+) -> tuple[AlignedLog, AlignedLog]:
+    """Return the log with its start and its command corrected for friction; with its start only."""
     command = aligned.command_mm_s2
     size = next_fast_len(len(command), real=True)
     f_hz = rfftfreq(size, 1.0 / aligned.rate_hz)
     earlier = irfft(rfft(command, size) * _earlier(f_hz, friction.late_s), size)[: len(command)]
     held = friction.held_mm * _bend_rate(aligned, response)
-    start_s = aligned.start_s - friction.late_s
-    return replace(aligned, command_mm_s2=earlier - held, start_s=start_s)
+    started = replace(aligned, command_mm_s2=earlier, start_s=aligned.start_s - friction.late_s)
+    return replace(started, command_mm_s2=earlier - held), started
+
+
+def better_explained(sliding: FrequencyResponse, stuck: FrequencyResponse) -> FrequencyResponse:
+    """Return the response corrected for friction, and the other one above where that is better.
+
+    Well above the resonance an axis moves so little that its guides stick, and act as springs.
+    """
+    gain = np.log(np.maximum(1.0 - sliding.coherence, 1e-9))
+    gain -= np.log(np.maximum(1.0 - stuck.coherence, 1e-9))
+    resonance_hz = sliding.f_hz[np.argmax(np.abs(sliding.response))]
+    above = sliding.f_hz > _ABOVE * resonance_hz
+    from_here = np.where(above, np.cumsum(gain[::-1])[::-1], -np.inf)
+    first = int(np.argmax(from_here))
+    sticks = np.arange(len(gain)) >= first
+    if not from_here[first] > _CLEARLY_STUCK * np.count_nonzero(sticks):
+        return sliding
+    return replace(
+        sliding,
+        response=np.where(sticks, stuck.response, sliding.response),
+        sd=np.where(sticks, stuck.sd, sliding.sd),
+        coherence=np.where(sticks, stuck.coherence, sliding.coherence),
+    )
 
 
 def _left(aligned: AlignedLog, response: FrequencyResponse) -> Array:

@@ -26,7 +26,7 @@ from stillpath.models.identification.estimation import (
     estimate_response,
 )
 from stillpath.models.identification.frame import LIKELY, likely_of
-from stillpath.models.identification.friction import Friction, dry_friction, freed
+from stillpath.models.identification.friction import Friction, better_explained, dry_friction, freed
 from stillpath.models.identification.messages import (
     body_notes,
     by_file,
@@ -426,10 +426,12 @@ class _AxisWork:
         """Return the response of a log corrected for dry friction of a motion over the frame."""
         log = self._used[number].measurement
         assert isinstance(log, AccelerationLog)
-        aligned = freed(self._aligned[number], motion, friction)
         test = excitation_for(log, self._settings)
-        again = estimate_aligned(log, aligned, test, label=response.label)
-        return replace(again, notes=response.notes)
+        sliding, stuck = (
+            estimate_aligned(log, aligned, test, label=response.label)
+            for aligned in freed(self._aligned[number], motion, friction)
+        )
+        return replace(better_explained(sliding, stuck), notes=response.notes)
 
     def _rubbing(self, plants: PlantSetSpec) -> PlantSetSpec:
         return plants.model_copy(update={"friction_mm": self._friction_mm or None})

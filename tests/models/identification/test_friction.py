@@ -10,9 +10,9 @@ import pytest
 from stillpath.models.identification.alignment import align
 from stillpath.models.identification.averaging import mean_response
 from stillpath.models.identification.estimation import estimate_aligned, estimate_response
-from stillpath.models.identification.friction import dry_friction, freed
+from stillpath.models.identification.friction import better_explained, dry_friction, freed
 from stillpath.models.identification.nozzle import frame_of
-from stillpath.models.identification.types import AccelerationLog, Excitation
+from stillpath.models.identification.types import AccelerationLog, Excitation, FrequencyResponse
 from stillpath.simulation.printers.drawing import draw
 from stillpath.simulation.printers.machines import Printer
 from stillpath.simulation.printers.resonance_test import NEW_TEST, OLD_TEST, drawn_sensor, run_test
@@ -25,6 +25,12 @@ def held_mm(printer: Printer, number: int) -> float:
     friction = bodies.frictions[number]
     along = np.array([friction.along.get(name, 0.0) for name in bodies.names])
     return float(1e3 * friction.force_n * printer.nozzle[number] @ np.linalg.solve(k, along))
+
+
+def rubbing(printer: Printer, times: float) -> Printer:
+    """Scale the dry friction of all guides."""
+    frictions = tuple(replace(one, force_n=times * one.force_n) for one in printer.bodies.frictions)
+    return replace(printer, bodies=replace(printer.bodies, frictions=frictions))
 
 
 def logs(  # type: ignore[no-untyped-def]
@@ -50,7 +56,7 @@ def test_it_is_told_by_the_log(test: Excitation) -> None:
     assert found.held_mm == pytest.approx(held_mm(printer, 0), rel=0.3)
     # What is left follows the command better.
     log, aligned, response = read[0]
-    again = estimate_aligned(log, freed(aligned, response, found), test)
+    again = estimate_aligned(log, freed(aligned, response, found)[0], test)
     low = (response.f_hz > 8) & (response.f_hz < 25)
     assert np.mean(1 - again.coherence[low]) < 0.9 * np.mean(1 - response.coherence[low])
 
@@ -71,8 +77,7 @@ def test_a_frame_that_shakes_does_not_hide_it(seed: int) -> None:
 
 def test_guides_that_do_not_rub_have_none() -> None:
     printer = draw("corexy", 3)
-    smooth = replace(printer, bodies=replace(printer.bodies, frictions=()))
-    read = logs(smooth, OLD_TEST)
+    read = logs(rubbing(printer, 0.0), OLD_TEST)
     assert dry_friction([one[1] for one in read], [[one[2] for one in read]]).held_mm < 2e-4
     assert mean_response([one[2] for one in read]).f_hz[0] < 10
 
@@ -81,10 +86,28 @@ def test_guides_that_do_not_rub_have_none() -> None:
 def test_strong_friction_delays_the_fundamental_which_alignment_takes_for_a_later_start(
     times: float,
 ) -> None:
-    printer = draw("bed slinger", 3)
-    strong = tuple(replace(one, force_n=times * one.force_n) for one in printer.bodies.frictions)
-    printer = replace(printer, bodies=replace(printer.bodies, frictions=strong))
+    printer = rubbing(draw("bed slinger", 3), times)
     read = logs(printer, OLD_TEST)
     found = dry_friction([one[1] for one in read], [[one[2] for one in read]])
     assert found.held_mm == pytest.approx(held_mm(printer, 0), rel=0.3)
     assert found.late_s > 0.0
+
+
+@pytest.mark.parametrize(("seed", "test"), [(0, NEW_TEST), (2, OLD_TEST)], ids=["new", "old"])
+def test_guides_that_stick_above_the_resonance_act_as_springs(seed: int, test: Excitation) -> None:
+    printer = draw("bed slinger", seed)
+    ((log, aligned, response),) = logs(rubbing(printer, 8.0), test)
+    found = dry_friction([aligned], [[response]])
+    sliding, stuck = (estimate_aligned(log, one, test) for one in freed(aligned, response, found))
+    both = better_explained(sliding, stuck)
+    sticks = both.response != sliding.response
+    resonance_hz = sliding.f_hz[np.argmax(np.abs(sliding.response))]
+    assert sliding.f_hz[sticks].min() > resonance_hz
+    # The same printer without friction is the truth.
+    ((_, _, smooth),) = logs(rubbing(printer, 0.0), test)
+    true = np.abs(smooth.response[sticks])
+
+    def error(found: FrequencyResponse) -> float:
+        return float(np.median(np.abs(np.abs(found.response[sticks]) - true) / true))
+
+    assert error(both) < 0.5 * error(sliding)
