@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
 
 from stillpath.compensation.base import Compensator, DesignError
 from stillpath.compensation.cautious import Caution
@@ -61,6 +62,9 @@ _ROUNDED = 1.0 + 1e-9
 _EXTRUDING_EXCESS_MM = 20e-3
 _TRAVEL_EXCESS_MM = 200e-3
 """Largest distance of the executed motion from the command beyond the tolerance."""
+_BRIEFLY, _BRIEF_S, _BRIEF_RMS = 2.0, 1.0, 0.25
+"""Twice that distance while extruding is allowed where its rms over a second is a quarter of it:
+less acceleration for a whole piece costs more than some hundredths of a second at its start."""
 
 
 class Unfit(ValueError):
@@ -425,11 +429,15 @@ def strayed(
         From `follow_tolerance_mm`.
     """
     worst = float(np.max(gap_mm, initial=0.0))
-    if worst <= tolerance_mm + _EXTRUDING_EXCESS_MM:
+    most_mm = tolerance_mm + _EXTRUDING_EXCESS_MM
+    if worst <= most_mm:
         return None
-    printed = float(np.max(gap_mm[extruding], initial=0.0))
-    if printed <= tolerance_mm + _EXTRUDING_EXCESS_MM and worst <= tolerance_mm + _TRAVEL_EXCESS_MM:
-        return None
+    printing = np.where(extruding, gap_mm, 0.0)
+    printed = float(np.max(printing, initial=0.0))
+    if worst <= tolerance_mm + _TRAVEL_EXCESS_MM and printed <= _BRIEFLY * most_mm:
+        squared = uniform_filter1d(printing**2, round(_BRIEF_S / DT_S), mode="constant")
+        if printed <= most_mm or squared.max() <= (_BRIEF_RMS * most_mm) ** 2:
+            return None
     return (
         f"the motion is {1e3 * printed:.1f} um from its command while extruding and "
         f"{1e3 * worst:.1f} um at worst (tolerance {1e3 * tolerance_mm:g} um)"
