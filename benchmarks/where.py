@@ -18,7 +18,7 @@ from readback import find_input, plain_copy, shared_folder
 from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine
 from stillpath.pipeline.compensate import compensate_file
-from stillpath.pipeline.options import DEFAULT_TOLERANCE_UM, Options, Where
+from stillpath.pipeline.options import Options, Where
 from stillpath.pipeline.result import Result
 from stillpath.pipeline.selection import Selection
 
@@ -58,7 +58,7 @@ def main() -> None:
     parser.add_argument("--machines", nargs="+", default=list(MACHINES), help="names or .json")
     parser.add_argument("--shared", type=Path, help="default: $STILLPATH_SHARED or ../shared")
     parser.add_argument("--where", nargs="+", choices=CHOICES, default=list(CHOICES))
-    parser.add_argument("--tolerance-um", nargs="+", type=float, default=[DEFAULT_TOLERANCE_UM])
+    parser.add_argument("--tolerance-um", nargs="+", type=float, default=[Options().tolerance_um])
     given = parser.parse_args()
     print(
         "um: tolerance; size: times the original; time: % beside the original; visible features: "

@@ -22,7 +22,6 @@ from stillpath.models.machine import Machine
 from stillpath.version import __version__
 
 __all__ = [
-    "DEFAULT_TOLERANCE_UM",
     "BasisName",
     "BudgetUm",
     "DialectName",
@@ -35,7 +34,7 @@ __all__ = [
     "unused",
 ]
 
-DEFAULT_TOLERANCE_UM = 2.0
+
 _LATER = {"budget_um": None, "where": "all", "max_mb": None, "compare_live": False}
 
 _PLAIN = (*COMPENSATORS, "none")
@@ -69,40 +68,73 @@ BudgetUm = Annotated[float, Field(ge=0.5, le=1000, allow_inf_nan=False)]
 class Options(BaseModel):
     """Settings of one compensation job; the same settings give the same bytes.
 
-    `method` is `fbf`, an approximate inverse (`compensation.inversion`), `none`, or `shaper:NAME`
-    with a firmware shaper's name; with `+ripple` appended the machine's ripple is undone as well.
-    `advise` leaves every move as it is and adds firmware commands (`pipeline.advising`). `live`
-    leaves the file as it is and predicts what the extra inside Klipper makes of it
-    (`pipeline.live_printing`); `compare_live` adds that prediction to a compensated file's report.
-    `basis`, `robust` and `along` are settings of `fbf`: `robust` says what it is designed for:
-    the set of plants that explain the measurement, with as much of a shaper's smoothing as no
-    member fares worse for (`auto`; a machine without a measured set: its one plant), the nominal
-    plant (`off`), or the set as given (`ensemble`, `minimax`). `along` is the weight of the error
-    along the path against that across it (None: 1). `plate` chooses one of several in a
-    3MF package; it is no setting of the compensation. `times` says whether the slicer's times in
-    the file follow the new motion. `dialect` is how the file is read (None: as the machine's
-    firmware reads it). `budget_um` is the contour error (root mean square while extruding, of the
-    worst plant of the machine's set) that every feature may have: the print becomes as fast as
-    that allows (None: it keeps its speeds).
-    `where` says which features are compensated (`pipeline.selection`); the others stay as
-    sliced, and the file is smaller. `max_mb` is the most that the G-code may have, in millions of
-    bytes: fewer features are compensated, and less exactly, until it fits.
+    `plate` is no setting of the compensation, and `compare_live` only adds to the report.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    method: MethodName = DEFAULT_METHOD
-    basis: BasisName = DEFAULT_BASIS
-    robust: RobustMode = "auto"
-    along: Annotated[float, Field(ge=0.01, le=1, allow_inf_nan=False)] | None = None
-    plate: Annotated[int, Field(ge=1)] | None = None
-    tolerance_um: Annotated[float, Field(ge=0.5, le=50, allow_inf_nan=False)] = DEFAULT_TOLERANCE_UM
-    times: Literal["new", "kept"] = "new"
-    dialect: DialectName | None = None
-    budget_um: BudgetUm | None = None
-    where: Where = "all"
-    max_mb: MaxMb | None = None
-    compare_live: bool = False
+    method: MethodName = Field(
+        default=DEFAULT_METHOD,
+        description="`fbf` (limited-preview filtered basis functions), `npz-ignore`, `zmetc`, "
+        "`zpetc`, `ebzpetc`, `ts` (approximate inverses), `shaper:NAME` (zv, mzv, ei, 2hump_ei, "
+        "3hump_ei) or `none`; with `+ripple` appended the machine's ripple is undone as well. "
+        "`advise` leaves all moves as they are and adds firmware commands. `live` leaves the file "
+        "as it is, which is then the result too, and predicts the compensation inside Klipper.",
+    )
+    basis: BasisName = Field(default=DEFAULT_BASIS, description="Basis functions of `fbf`.")
+    robust: RobustMode = Field(
+        default="auto",
+        description="What `fbf` is designed for: all plants that explain the measurement, with as "
+        "much of a shaper's smoothing as no plant fares worse for (`auto`), the nominal plant "
+        "(`off`), or the machine's plant set by least squares (`ensemble`) or for its worst member "
+        "(`minimax`).",
+    )
+    along: float | None = Field(
+        default=None,
+        ge=0.01,
+        le=1,
+        allow_inf_nan=False,
+        description="Weight of errors along the path against those across it, for `fbf`; "
+        "less than the default, 1, takes longer.",
+    )
+    plate: int | None = Field(
+        default=None, ge=1, le=10_000, description="Which plate of a 3MF package with several."
+    )
+    tolerance_um: float = Field(
+        default=2.0,
+        ge=0.5,
+        le=50,
+        allow_inf_nan=False,
+        description="How far the written path may be from the computed one.",
+    )
+    times: Literal["new", "kept"] = Field(
+        default="new", description="Whether the slicer's times in the file follow the new motion."
+    )
+    dialect: DialectName | None = Field(
+        default=None,
+        description="How the file is read; by default as the machine's firmware reads it.",
+    )
+    budget_um: BudgetUm | None = Field(
+        default=None,
+        description="Contour error that every feature may have, rms of the worst plant of the "
+        "machine's set: the print becomes as fast as that allows. By default it keeps its speeds.",
+    )
+    where: Where = Field(
+        default="all",
+        description="What is compensated: everything, what is `visible` (outer walls, top and "
+        "bottom surfaces), or outer `walls`. The rest stays as sliced, and the file is smaller.",
+    )
+    max_mb: MaxMb | None = Field(
+        default=None,
+        description="The most that the G-code may have, in millions of bytes: what is visible is "
+        "compensated, then less exactly (tolerances of 8 and 16 um), then outer walls alone, until "
+        "it fits.",
+    )
+    compare_live: bool = Field(
+        default=False,
+        description="Whether the report of a compensated file also says what the compensation "
+        "inside Klipper would make of the sliced file. The print is planned once more for it.",
+    )
 
     @property
     def vibration(self) -> str:

@@ -220,7 +220,7 @@ class Intake:
             batch=wanted.batch,
             machine=wanted.machine,
             machine_revision=pinned.machine.revision,
-            options=wanted.options().model_dump(),
+            options=wanted.options(),
             dedupe_key=dedupe_key,
             priority=wanted.priority,
             source_name=upload.name,
@@ -406,7 +406,7 @@ def _dedupe_key(wanted: JobQuery, upload: Upload, pinned: PinnedMachine) -> str:
         upload.sha256,
         upload.name,  # stands in the report
         pinned.machine.revision,
-        wanted.options().model_dump(),
+        wanted.options(),
         wanted.batch,  # a list of a batch must be whole
         __version__,
     )

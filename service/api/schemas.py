@@ -2,31 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    ConfigDict,
-    Field,
-    ValidationError,
-    model_validator,
-)
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-from stillpath.compensation.defaults import DEFAULT_BASIS, DEFAULT_METHOD
-from stillpath.models.complaints import complaint
-from stillpath.pipeline.options import (
-    DEFAULT_TOLERANCE_UM,
-    BasisName,
-    BudgetUm,
-    DialectName,
-    MaxMb,
-    MethodName,
-    Options,
-    RobustMode,
-    Where,
-)
+from stillpath.pipeline.options import Options
 from stillpath.service.deliveries.targets import read_url
 from stillpath.service.jobs.state import Job, JobKind, JobState
 
@@ -35,6 +17,7 @@ if TYPE_CHECKING:
 
 __all__ = ["DeliveryView", "Health", "JobPage", "JobQuery", "JobView", "LayerIndex", "Links"]
 
+_FIELDS = {field.name for field in fields(Job)}
 _EXAMPLE: dict[str, Any] = {
     "id": "5f2c8e0e6c0d4a3f9d1b7a52c4e86f10",
     "kind": "compensation",
@@ -97,74 +80,14 @@ def _is_line(text: str) -> str:
 Line = Annotated[str, AfterValidator(_is_line)]
 
 
-class JobQuery(BaseModel):
+class JobQuery(Options):
     """Parameters of a job, beside the file.
 
-    A name that is not known is refused: a misspelt `budget_um` must not become a job without one.
+    An unknown name is refused: a misspelt `budget_um` must not become a job without one.
     """
-
-    model_config = ConfigDict(extra="forbid")
 
     machine: Line = Field(
         max_length=255, description="A name from `/v1/machines`.", examples=["ender3"]
-    )
-    method: MethodName = Field(
-        default=DEFAULT_METHOD,
-        description="`fbf` (limited-preview filtered basis functions), `npz-ignore`, `zmetc`, "
-        "`zpetc`, `ebzpetc`, `ts` (approximate inverses), `shaper:NAME` (zv, mzv, ei, 2hump_ei, "
-        "3hump_ei) or `none`; with `+ripple` appended the machine's ripple is undone as well. "
-        "`advise` leaves all moves as they are and adds firmware commands. `live` leaves the file "
-        "as it is, which is then the result too, and predicts the compensation inside Klipper.",
-    )
-    basis: BasisName = Field(default=DEFAULT_BASIS, description="Basis functions of `fbf`.")
-    robust: RobustMode = Field(
-        default="auto",
-        description="What `fbf` is designed for: all plants that explain the measurement, with as "
-        "much of a shaper's smoothing as they ask for (`auto`), the nominal plant (`off`), or the "
-        "machine's plant set by least squares (`ensemble`) or for its worst member (`minimax`).",
-    )
-    along: Annotated[float, Field(ge=0.01, le=1, allow_inf_nan=False)] | None = Field(
-        default=None,
-        description="Weight of errors along the path against those across it, for `fbf`; "
-        "less than the default, 1, takes longer.",
-    )
-    tolerance_um: float = Field(
-        default=DEFAULT_TOLERANCE_UM,
-        ge=0.5,
-        le=50,
-        allow_inf_nan=False,
-        description="How far the written path may be from the computed one.",
-    )
-    where: Where = Field(
-        default="all",
-        description="What is compensated: everything, what is `visible` (outer walls, top and "
-        "bottom surfaces), or outer `walls`. The rest stays as sliced, and the file is smaller.",
-    )
-    max_mb: MaxMb | None = Field(
-        default=None,
-        description="The most that the G-code may have, in millions of bytes: what is visible is "
-        "compensated, then less exactly (tolerances of 8 and 16 um), then outer walls alone, until "
-        "it fits.",
-    )
-    budget_um: BudgetUm | None = Field(
-        default=None,
-        description="Contour error that every feature may have, rms of the worst plant of the "
-        "machine's set: the print becomes as fast as that allows. By default it keeps its speeds.",
-    )
-    compare_live: bool = Field(
-        default=False,
-        description="Whether the report of a compensated file says too what the compensation "
-        "inside Klipper would make of the sliced file. The print is planned once more for it.",
-    )
-    plate: Annotated[int, Field(ge=1, le=10_000)] | None = Field(
-        default=None, description="Which plate of a 3MF package with several."
-    )
-    times: Literal["new", "kept"] = Field(
-        default="new", description="Whether the slicer's times in the file follow the new motion."
-    )
-    dialect: DialectName | None = Field(
-        default=None,
-        description="How the file is read; by default as the machine's firmware reads it.",
     )
     name: str = Field(
         default="upload.gcode",
@@ -199,18 +122,9 @@ class JobQuery(BaseModel):
     )
     print: bool = Field(default=False, description="Whether that printer starts to print it.")
 
-    @model_validator(mode="after")
-    def _fit_together(self) -> JobQuery:
-        try:
-            self.options()
-        except ValidationError as error:
-            first = error.errors(include_url=False)[0]
-            raise ValueError(complaint(first, repeat=False)) from None
-        return self
-
-    def options(self) -> Options:
+    def options(self) -> dict[str, Any]:
         """Return the settings of the compensation among the parameters."""
-        return Options.model_validate(self.model_dump(include=set(Options.model_fields)))
+        return self.model_dump(include=set(Options.model_fields))
 
 
 class Links(BaseModel):
@@ -311,38 +225,16 @@ class JobView(BaseModel):
         if job.kind is JobKind.COMPENSATION:
             made += ["report", "report.json", "layers", "trajectories"]
         links = {name.replace(".", "_"): f"{here}/{name}" for name in made if done}
-        return cls(
-            id=job.id,
-            kind=job.kind,
-            state=job.state,
-            stage=_stage(job),
-            room_bytes=job.room_bytes if job.waits_for_room else None,
-            progress=job.progress,
-            eta_s=job.eta_s,
-            queue_position=queue_position,
-            attempt=job.attempt,
-            losses=job.losses,
-            owner=job.owner,
-            batch=job.batch,
-            priority=job.priority,
-            machine=job.machine,
-            machine_revision=job.machine_revision,
-            options=job.options,
-            source_name=job.source_name,
-            source_bytes=job.source_bytes,
-            source_sha256=job.source_sha256,
-            result_name=job.result_name,
-            result_bytes=job.result_bytes,
-            summary=job.summary,
-            webhook=job.webhook,
-            printer=job.printer,
-            print=job.print_after,
-            created_at=datetime.fromtimestamp(job.created_at, UTC),
-            started_at=_moment(job.started_at),
-            finished_at=_moment(job.finished_at),
-            error=job.problem,
-            links=Links(self=here, events=f"{here}/events", **links),
-        )
+        stored = {name: getattr(job, name) for name in cls.model_fields.keys() & _FIELDS}
+        shown = {
+            "stage": _stage(job),
+            "room_bytes": job.room_bytes if job.waits_for_room else None,
+            "queue_position": queue_position,
+            "print": job.print_after,
+            "error": job.problem,
+            "links": Links(self=here, events=f"{here}/events", **links),
+        }
+        return cls.model_validate(stored | shown)
 
 
 class JobPage(BaseModel):
