@@ -32,11 +32,11 @@ def design(
     check_folder(report)
     found = open_machines().to_look_at(machine, files=True).machine
 
-    from stillpath.applications.design.design import DesignSettings, design_report
+    from stillpath.applications.design.design import design_report
     from stillpath.applications.design.page import write_design
     from stillpath.cli.design_tables import print_design
 
-    made = design_report(found, axis, DesignSettings(basis=basis, robust=robust))
+    made = design_report(found, axis, basis=basis, robust=robust)
     if report is not None:
         write_design(made, report)
     print_design(made)

@@ -13,8 +13,8 @@ from stillpath.cli.arguments import check_folder, check_output
 from stillpath.cli.option_groups import grouped
 
 if TYPE_CHECKING:
-    from stillpath.applications.controllers.options import Disturbance
     from stillpath.applications.scanning.scan import ScanSettings
+    from stillpath.models.disturbances import DisturbanceSpec
 
 __all__ = ["register"]
 
@@ -124,13 +124,13 @@ def scan(
     print_scan(made.report)
 
 
-def _read(file: Path) -> Disturbance:
+def _read(file: Path) -> DisturbanceSpec:
     from pydantic import TypeAdapter, ValidationError
 
-    from stillpath.applications.controllers.options import Disturbance
     from stillpath.models.complaints import complaint
+    from stillpath.models.disturbances import DisturbanceSpec
 
-    adapter: TypeAdapter[Disturbance] = TypeAdapter(Disturbance)
+    adapter: TypeAdapter[DisturbanceSpec] = TypeAdapter(DisturbanceSpec)
     try:
         return adapter.validate_python(json.loads(file.read_bytes()))
     except ValidationError as error:

@@ -41,7 +41,7 @@ from stillpath.models.machine import Machine, MotorLimits
 from stillpath.models.plants import DiscretePlant, PlantSet, plant_set
 from stillpath.models.schedule import OperatingPoint
 
-__all__ = ["LADDER", "ROBUST", "PreviewFbf", "Rung"]
+__all__ = ["LADDER", "ROBUST", "UPDATE_S", "WINDOW_S", "PreviewFbf", "Rung"]
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -52,6 +52,8 @@ ROBUST = ("off", "ensemble", "minimax")
 """off: the nominal plant; ensemble: weighted least squares over the set; minimax: the same with
 weights that balance the members' errors."""
 
+WINDOW_S, UPDATE_S = 0.3, 0.15
+"""Preview window, and the part of it committed before the next one starts."""
 ACCEL_RATIO = 1.4
 """Largest ratio of the command's peak acceleration to the planned path's; X and Y together then
 stay below twice the path's."""
@@ -81,8 +83,6 @@ class PreviewFbf:
         Weight of the error along the path relative to that across it, above 0. The default 1 is
         plain least squares. With .09 the error of a set across the path is somewhat smaller
         (docs/benchmarks.md), at about ten times the computing time.
-    window_s, update_s : float
-        Preview window, and the part of it committed before the next one starts.
 
     Attributes
     ----------
@@ -115,8 +115,6 @@ class PreviewFbf:
         basis: str = DEFAULT_BASIS,
         robust: str = "off",
         along: float | None = None,
-        window_s: float = 0.3,
-        update_s: float = 0.15,
     ) -> None:
         if basis not in BASES:
             raise DesignError(f"no basis is called {basis!r}; there are {', '.join(BASES)}")
@@ -130,7 +128,7 @@ class PreviewFbf:
         along = 1.0 if along is None else along
         if not 0.0 < along <= 1.0:
             raise DesignError(f"weight along the path is {along}; above 0 and at most 1 needed")
-        window, update = round(window_s / dt_s), round(update_s / dt_s)
+        window, update = round(WINDOW_S / dt_s), round(UPDATE_S / dt_s)
         self._dt_s = dt_s
         self.along = along
         self._limits = [machine.command.of("x"), machine.command.of("y")]

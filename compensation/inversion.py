@@ -282,9 +282,7 @@ def _ts(zeros: Roots, b: Array, order: int, dt_s: float) -> TwoSidedFilter:  # n
     return TwoSidedFilter(len(future) - len(inside), np.convolve(future, past))
 
 
-Approximation = Callable[[Roots, Array, int, float], TwoSidedFilter]
-
-KINDS: dict[str, Approximation] = {
+KINDS: dict[str, Callable[[Roots, Array, int, float], TwoSidedFilter]] = {
     "npz-ignore": _npz_ignore,
     "zmetc": _zmetc,
     "zpetc": _zpetc,

@@ -100,7 +100,6 @@ def build_timeline(
     *,
     lead_s: float = 0.0,
     tail_s: float = 0.0,
-    end_s: float = 0.0,
 ) -> Timeline:
     """Lay a piece on the sampling grid.
 
@@ -116,12 +115,10 @@ def build_timeline(
         Sampling time.
     lead_s, tail_s : float
         Standing time before and after every stretch, for compensators that need it.
-    end_s : float
-        Standing time after the last group, at most which the command may take to settle.
     """
     duration = phases.lasts_s
     start, end, row_start, rests = _laid(groups, duration, rest_s, dt_s, lead_s, tail_s)
-    samples = int(np.ceil(end[-1] / dt_s - _GRID_EPS)) + 1 + round(end_s / dt_s)
+    samples = int(np.ceil(end[-1] / dt_s - _GRID_EPS)) + 1
     moved = replace(phases, t_s=row_start)
     until = np.where(phases.moves_xy, row_start + duration + _GRID_EPS * dt_s, -np.inf)
     position, row, moving = sample_until(moved, (0.0, dt_s, samples), until)

@@ -111,7 +111,7 @@ DisturbanceSpec = Annotated[
 
 
 def sample(
-    spec: Narrowband | Switched | Wideband | Periodic,
+    spec: DisturbanceSpec,
     samples: int,
     dt_s: float,
     generator: np.random.Generator | None = None,

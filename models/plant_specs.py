@@ -86,11 +86,19 @@ class _Plant(Document):
         return self
 
 
-class Mode(Document):
-    """One resonance: gain / (1 + 2 zeta s/w + s^2/w^2) with w = 2 pi f_hz."""
-
+class _Resonance(Document):
     f_hz: Positive
     zeta: Damping
+
+    def scaled(self, frequency: float, damping: float) -> Self:
+        """Return it with frequency and damping ratio multiplied."""
+        values = {"f_hz": self.f_hz * frequency, "zeta": self.zeta * damping}
+        return self.model_validate(dict(self) | values)
+
+
+class Mode(_Resonance):
+    """One resonance: gain / (1 + 2 zeta s/w + s^2/w^2) with w = 2 pi f_hz."""
+
     gain: Finite = 1.0
 
 
@@ -102,18 +110,13 @@ class ModesSpec(_Plant):
 
     def scaled(self, frequency: float, damping: float) -> ModesSpec:
         """See `_Plant.scaled`."""
-        return ModesSpec(
-            modes=tuple(
-                Mode(f_hz=m.f_hz * frequency, zeta=m.zeta * damping, gain=m.gain)
-                for m in self.modes
-            )
-        )
+        return ModesSpec(modes=tuple(m.scaled(frequency, damping) for m in self.modes))
 
     def _as_written(self) -> Roots:
         return _sum_of_modes(tuple((m.f_hz, m.zeta, m.gain, 0.0) for m in self.modes))
 
 
-class RelativeMode(Document):
+class RelativeMode(_Resonance):
     """share (2 zeta s/w + 1) / (1 + 2 zeta s/w + s^2/w^2), w = 2 pi f_hz.
 
     Attributes
@@ -126,8 +129,6 @@ class RelativeMode(Document):
         parts that move: `2 zeta s/w` of the numerator is multiplied by 1 - grounded.
     """
 
-    f_hz: Positive
-    zeta: Damping
     share: Finite
     grounded: Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)] = 0.0
 
@@ -158,28 +159,19 @@ class RelativeModesSpec(_Plant):
 
     def scaled(self, frequency: float, damping: float) -> RelativeModesSpec:
         """See `_Plant.scaled`."""
-        return RelativeModesSpec(
-            modes=tuple(
-                m.model_copy(update={"f_hz": m.f_hz * frequency, "zeta": m.zeta * damping})
-                for m in self.modes
-            )
-        )
+        return RelativeModesSpec(modes=tuple(m.scaled(frequency, damping) for m in self.modes))
 
     def _as_written(self) -> Roots:
         return _sum_of_modes(tuple((m.f_hz, m.zeta, m.share, 1.0 - m.grounded) for m in self.modes))
 
 
-class PolePair(Document):
+class PolePair(_Resonance):
     """1 + 2 zeta s/w + s^2/w^2 in the denominator, w = 2 pi f_hz."""
 
-    f_hz: Positive
-    zeta: Damping
 
-
-class ZeroPair(Document):
+class ZeroPair(_Resonance):
     """1 + 2 zeta s/w + s^2/w^2 in the numerator; zeta < 0 is non-minimum phase."""
 
-    f_hz: Positive
     zeta: Annotated[float, Field(ge=-10, le=10, allow_inf_nan=False)]
 
 
@@ -205,12 +197,8 @@ class PairsSpec(_Plant):
     def scaled(self, frequency: float, damping: float) -> PairsSpec:
         """See `_Plant.scaled`; `real_zero_tau_s` stays."""
         return PairsSpec(
-            poles=tuple(
-                PolePair(f_hz=p.f_hz * frequency, zeta=p.zeta * damping) for p in self.poles
-            ),
-            zeros=tuple(
-                ZeroPair(f_hz=z.f_hz * frequency, zeta=z.zeta * damping) for z in self.zeros
-            ),
+            poles=tuple(p.scaled(frequency, damping) for p in self.poles),
+            zeros=tuple(z.scaled(frequency, damping) for z in self.zeros),
             real_zero_tau_s=self.real_zero_tau_s,
         )
 

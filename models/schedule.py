@@ -247,7 +247,6 @@ def moving_mass_from_two_runs(
     *,
     f0_sd_hz: float = 0.0,
     f1_sd_hz: float = 0.0,
-    added_sd_kg: float = 0.0,
 ) -> MovingMass:
     """Return the moving mass from the resonance without and with a known weight on the bed.
 
@@ -259,7 +258,7 @@ def moving_mass_from_two_runs(
         Frequency of the bed's mode with the bed empty, and with the weight at its centre.
     added_kg : float
         The weight.
-    f0_sd_hz, f1_sd_hz, added_sd_kg : float
+    f0_sd_hz, f1_sd_hz : float
         Standard deviations; that of the result is propagated to first order.
 
     Raises
@@ -280,7 +279,7 @@ def moving_mass_from_two_runs(
     ratio = (f0_hz / f1_hz) ** 2
     mass_kg = added_kg / (ratio - 1.0)
     relative = 2.0 * ratio / (ratio - 1.0) * math.hypot(f0_sd_hz / f0_hz, f1_sd_hz / f1_hz)
-    sd_kg = mass_kg * math.hypot(relative, added_sd_kg / added_kg)
+    sd_kg = mass_kg * relative
     if sd_kg > 0.5 * mass_kg:
         raise ModelError(
             f"{f0_hz:g} Hz without and {f1_hz:g} Hz with {added_kg:g} kg give {mass_kg:.3g} kg "
@@ -304,35 +303,17 @@ def resonances_hz(plant: PlantSpec) -> NDArray[np.float64]:
 
 def _scaled(plant: PlantSpec, factor: float, chosen: Collection[int]) -> PlantSpec:
     """Return the plant with frequency and damping of some resonances multiplied by `factor`."""
-    if isinstance(plant, ModesSpec):
+    if isinstance(plant, (ModesSpec, RelativeModesSpec)):
         by = _factors([m.f_hz for m in plant.modes], factor, chosen)
-        return ModesSpec(
-            modes=tuple(
-                Mode(f_hz=m.f_hz * g, zeta=m.zeta * g, gain=m.gain)
-                for m, g in zip(plant.modes, by, strict=True)
-            )
-        )
-    if isinstance(plant, RelativeModesSpec):
-        by = _factors([m.f_hz for m in plant.modes], factor, chosen)
-        return RelativeModesSpec(
-            modes=tuple(
-                m.model_copy(update={"f_hz": m.f_hz * g, "zeta": m.zeta * g})
-                for m, g in zip(plant.modes, by, strict=True)
-            )
-        )
+        modes = tuple(m.scaled(g, g) for m, g in zip(plant.modes, by, strict=True))
+        return plant.model_validate({"modes": modes})
     if isinstance(plant, PairsSpec):
         poles = [p.f_hz for p in plant.poles]
         by = _factors(poles, factor, chosen)
         follow = [by[_nearest(poles, z.f_hz)] for z in plant.zeros]
         return PairsSpec(
-            poles=tuple(
-                PolePair(f_hz=p.f_hz * g, zeta=p.zeta * g)
-                for p, g in zip(plant.poles, by, strict=True)
-            ),
-            zeros=tuple(
-                ZeroPair(f_hz=z.f_hz * g, zeta=z.zeta * g)
-                for z, g in zip(plant.zeros, follow, strict=True)
-            ),
+            poles=tuple(p.scaled(g, g) for p, g in zip(plant.poles, by, strict=True)),
+            zeros=tuple(z.scaled(g, g) for z, g in zip(plant.zeros, follow, strict=True)),
             # c / k of the damper between motor and bed: no mass in it.
             real_zero_tau_s=plant.real_zero_tau_s,
         )

@@ -78,8 +78,8 @@ class GroupFigures(_Figures):
 
     name: str
     """Number of the layer from 0, or the slicer's name of the feature."""
-    title: str = ""
-    """The same for a person; empty in reports of earlier versions."""
+    title: str
+    """The same for a person."""
     seconds: float
     """Time in which it is extruded [s]."""
     contour_rms_um: dict[str, float]
@@ -160,8 +160,8 @@ class BudgetClass(_Figures):
     name: str
     """The slicer's name of the feature, `travel`, or `all that stays as sliced`: the first layer,
     and lines that stay as sliced."""
-    title: str = ""
-    """The same for a person; empty in reports of earlier versions."""
+    title: str
+    """The same for a person."""
     acceleration_factor: float
     """Ratio of its accelerations to the file's, before the machine's limits; 1: as in the file."""
     shaper_acceleration_factor: float
@@ -213,8 +213,8 @@ class AdvisedFeature(_Figures):
 
     name: str
     """The slicer's name of the feature, or `unnamed`."""
-    title: str = ""
-    """The same for a person; empty in reports of earlier versions."""
+    title: str
+    """The same for a person."""
     accel_mm_s2: float | None
     """Acceleration [mm/s^2]; null: as the file has it."""
     exact: bool

@@ -63,8 +63,6 @@ class Client:
         As in a browser: ``http://127.0.0.1:8000``.
     key : str, optional
         An API key.
-    timeout_s : float
-        How long one answer may take to begin.
     patience_s : float
         For how long a service that does not answer, or is busy, is asked again.
 
@@ -74,15 +72,8 @@ class Client:
         If `server` is no address. Every method raises it; see there.
     """
 
-    def __init__(
-        self,
-        server: str,
-        key: str | None = None,
-        *,
-        timeout_s: float = 60.0,
-        patience_s: float = 30.0,
-    ) -> None:
-        self._connection = Connection(server, key, timeout_s=timeout_s, patience_s=patience_s)
+    def __init__(self, server: str, key: str | None = None, *, patience_s: float = 30.0) -> None:
+        self._connection = Connection(server, key, patience_s=patience_s)
         self.server = self._connection.server
 
     def __enter__(self) -> Self:

@@ -34,6 +34,8 @@ Found = TypeVar("Found")
 FIRST_PAUSE_S = 0.2
 _BUSY = (408, 429, 502, 503, 504)
 _LONGEST_PAUSE_S = 5.0
+_ANSWER_S = 60.0
+"""How long one answer may take to begin."""
 _SILENCE_S = 45.0
 """Watching is given up when nothing came for so long; the service sends something every 15 s."""
 _GOES, _FETCHES = 3, 4
@@ -87,9 +89,7 @@ class Connection:
         If `server` is no address, or `key` no key.
     """
 
-    def __init__(
-        self, server: str, key: str | None, *, timeout_s: float, patience_s: float
-    ) -> None:
+    def __init__(self, server: str, key: str | None, *, patience_s: float) -> None:
         host = _host_of(server)
         if host is None:
             raise ClientError(
@@ -107,7 +107,7 @@ class Connection:
         self._http = httpx2.Client(
             base_url=self.server,
             headers=headers,
-            timeout=timeout_s,
+            timeout=_ANSWER_S,
             follow_redirects=False,
             trust_env=host not in ("localhost", "127.0.0.1", "::1"),
         )

@@ -13,7 +13,7 @@ from pydantic import Field, TypeAdapter, ValidationError
 
 from stillpath.compensation.base import DesignError
 from stillpath.models.complaints import complaint
-from stillpath.models.disturbances import Narrowband, Periodic, Switched, Wideband
+from stillpath.models.disturbances import DisturbanceSpec
 from stillpath.models.document import Document
 from stillpath.models.loops import LoopSpec, load_loop
 
@@ -21,7 +21,6 @@ __all__ = [
     "METHODS",
     "AdaptiveOptions",
     "ControllerOptions",
-    "Disturbance",
     "DobOptions",
     "FmsdobOptions",
     "InverseDobOptions",
@@ -38,7 +37,6 @@ __all__ = [
 Frequency = Annotated[float, Field(ge=1e-3, le=1e6, allow_inf_nan=False)]
 Targets = Annotated[tuple[Frequency, ...], Field(min_length=1, max_length=8)]
 Shape = Literal["pointwise", "hermite"]
-Disturbance = Annotated[Narrowband | Switched | Wideband | Periodic, Field(discriminator="kind")]
 LoopName = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]*$", max_length=64)]
 LoopReference = LoopName | LoopSpec
 """A built-in closed-loop machine, or a whole one as a document; never a path."""
@@ -64,7 +62,7 @@ class _Options(Document):
 
     loop: LoopSpec | None = None
     uncertainty: Annotated[float, Field(gt=0, le=10, allow_inf_nan=False)] | None = None
-    disturbance: Disturbance | None = None
+    disturbance: DisturbanceSpec | None = None
     enters: Literal["output", "input"] | None = None
     duration_s: Annotated[float, Field(gt=0, le=60, allow_inf_nan=False)] | None = None
 

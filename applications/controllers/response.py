@@ -19,7 +19,6 @@ from stillpath.applications.controllers.figures import (
 from stillpath.applications.controllers.options import (
     AdaptiveOptions,
     ControllerOptions,
-    Disturbance,
     DobOptions,
     MmpOptions,
     MultirateOptions,
@@ -32,6 +31,7 @@ from stillpath.compensation.feedback.controller import Controller
 from stillpath.compensation.feedback.fmsdob import fmsdob
 from stillpath.models.diagrams import Block
 from stillpath.models.disturbances import (
+    DisturbanceSpec,
     Narrowband,
     Periodic,
     SensorSpec,
@@ -78,13 +78,13 @@ class Trace:
     after: Array
 
 
-def disturbance_of(options: ControllerOptions, loop: Loop) -> tuple[Disturbance, str]:
+def disturbance_of(options: ControllerOptions, loop: Loop) -> tuple[DisturbanceSpec, str]:
     """Return the disturbance of the time response, and where it enters.
 
     By default it is what the method is made for: its tones, five harmonics of its fundamental, or a
     slow load that changes sign.
     """
-    made: Disturbance
+    made: DisturbanceSpec
     if isinstance(options, WideOptions | QuasiOptions | MultirateOptions):
         count = min(_HARMONICS, max(1, math.ceil(0.5 / (loop.dt_s * options.fundamental_hz)) - 1))
         made, enters = Periodic(f_hz=options.fundamental_hz, amplitudes=(1.0,) * count), "input"
@@ -124,7 +124,7 @@ def answer(
 
 
 def adapted(
-    loops: Sequence[Loop], options: AdaptiveOptions, disturbance: Disturbance, enters: str
+    loops: Sequence[Loop], options: AdaptiveOptions, disturbance: DisturbanceSpec, enters: str
 ) -> tuple[Controller, Trace]:
     """Run an adaptive observer through the disturbance; return its last controller and the run.
 
@@ -166,7 +166,7 @@ def time_figures(
     loops: Sequence[Loop],
     controller: Controller,
     options: ControllerOptions,
-    disturbance: Disturbance,
+    disturbance: DisturbanceSpec,
     enters: str,
     trace: Trace | None,
 ) -> TimeFigures:
@@ -223,7 +223,7 @@ def settling_ticks(radius: float) -> float:
     return math.log(1e-3) / math.log(max(radius, 1e-6))
 
 
-def disturbance_text(disturbance: Disturbance) -> str:
+def disturbance_text(disturbance: DisturbanceSpec) -> str:
     """Return the disturbance in words."""
     if isinstance(disturbance, Wideband):
         return f"random, {len(disturbance.peaks)} humps in its spectrum"
@@ -235,7 +235,7 @@ def disturbance_text(disturbance: Disturbance) -> str:
     return f"tones of {', '.join(f'{tone.f_hz:g}' for tone in disturbance.tones)} Hz"
 
 
-def _check(disturbance: Disturbance) -> None:
+def _check(disturbance: DisturbanceSpec) -> None:
     if isinstance(disturbance, Switched):
         count, starts = len(disturbance.parts), disturbance.start_s
         if not count or len(starts) != count:
@@ -276,7 +276,7 @@ def _jumping(tones: int, dt_s: float) -> Switched:
     )
 
 
-def _spoken(disturbance: Disturbance, dt_s: float) -> int:
+def _spoken(disturbance: DisturbanceSpec, dt_s: float) -> int:
     """Return the samples needed until the last of switched tones has settled."""
     last = disturbance.start_s[-1] if isinstance(disturbance, Switched) else 0.0
     return round(last / dt_s) + 2 * _PART_SAMPLES
@@ -295,13 +295,13 @@ def _samples(duration_s: float | None, dt_s: float, needed: int, ticks: int = 1)
     return samples
 
 
-def _last_periods(disturbance: Disturbance, dt_s: float, samples: int) -> int:
+def _last_periods(disturbance: DisturbanceSpec, dt_s: float, samples: int) -> int:
     """Return how many of the last samples show some periods of the slowest tone."""
     lowest = min(_frequencies(disturbance), default=50 / (samples * dt_s))
     return int(min(max(_PERIODS_SHOWN / (lowest * dt_s), 60), samples // 4, _POINTS))
 
 
-def _frequencies(disturbance: Disturbance) -> list[float]:
+def _frequencies(disturbance: DisturbanceSpec) -> list[float]:
     if isinstance(disturbance, Periodic):
         return [disturbance.f_hz]
     if isinstance(disturbance, Wideband):

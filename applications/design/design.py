@@ -32,7 +32,7 @@ from stillpath.applications.design.robustness import Trial
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.basis import BASES, ZERO
 from stillpath.compensation.defaults import DEFAULT_BASIS
-from stillpath.compensation.fbf import ROBUST, PreviewFbf
+from stillpath.compensation.fbf import ROBUST, UPDATE_S, WINDOW_S, PreviewFbf
 from stillpath.compensation.lifted import LiftedSet, integrated, lift, lifted_set
 from stillpath.compensation.lifted_window import LiftedWindow, lifted_window
 from stillpath.compensation.metrics import (
@@ -51,38 +51,24 @@ from stillpath.pipeline.caution import design_mode
 from stillpath.pipeline.measuring.reference_shaper import BestShaper, tune_each
 from stillpath.version import __version__
 
-__all__ = ["AXES", "ERRORS_PERCENT", "DesignSettings", "design_report"]
+__all__ = ["AXES", "ERRORS_PERCENT", "design_report"]
 
 Array = NDArray[np.float64]
 
 AXES = ("x", "y")
 ERRORS_PERCENT = tuple(range(-20, 21, 2))
 """Frequency errors at which every command is evaluated."""
+_DT_S = 1e-3
+_WINDOW, _UPDATE = round(WINDOW_S / _DT_S), round(UPDATE_S / _DT_S)
 _FREQUENCIES_HZ = tuple(np.geomspace(5.0, 200.0, 160).round(3).tolist())
-
-
-@dataclass(frozen=True, slots=True)
-class DesignSettings:
-    """Settings of `compensation.fbf.PreviewFbf`.
-
-    `robust` may also be ``auto``: the mode that jobs take by default, before a shaper's smoothing
-    comes in. `dt_s` is the sampling time; `window_s` the preview window, of which `update_s` is
-    committed before the next one starts.
-    """
-
-    basis: str = DEFAULT_BASIS
-    robust: str = "off"
-    along: float | None = None
-    dt_s: float = 1e-3
-    window_s: float = 0.3
-    update_s: float = 0.15
 
 
 def design_report(
     machine: Machine,
     axis: str,
-    settings: DesignSettings = DesignSettings(),
     *,
+    basis: str = DEFAULT_BASIS,
+    robust: str = "off",
     errors_percent: Sequence[float] = ERRORS_PERCENT,
     shapers: Sequence[str] = SHAPERS,
     motion: tuple[Array, NDArray[np.bool_]] | None = None,
@@ -94,10 +80,10 @@ def design_report(
     ----------
     machine : Machine
     axis : {"x", "y"}
-    errors_percent : sequence of float
-        Frequency errors of this axis at which every command is evaluated.
-    shapers : sequence of str
-        Firmware shapers to compare with.
+    basis, robust : str
+        As of `compensation.fbf.PreviewFbf`; ``auto`` is the mode of jobs, without a shaper's share.
+    errors_percent, shapers : sequences of float and str
+        Frequency errors of this axis at which every command is evaluated, among them shapers.
     motion : (path, extruding), optional
         Shapes (2, n) in mm and (n,); default: the reference motion, some 25 s.
     tuned : mapping, optional
@@ -107,15 +93,14 @@ def design_report(
     Raises
     ------
     DesignError
-        For an unknown axis, basis or robust mode. A refused design is a result, not an error: the
-        report says which and why.
+        For an unknown axis, basis or robust mode; why a design is refused stands in the report.
     """
-    made = _designed(machine, axis, settings)
-    trial = Trial(machine, axis, settings.dt_s, motion, errors_percent)
+    made = _designed(machine, axis, basis, robust)
+    trial = Trial(machine, axis, _DT_S, motion, errors_percent)
     missing = [*made.missing, *trial.notes]
     own = _own_curves(trial, made.by_mode, made.ladder, missing)
     if tuned is None:
-        tuned = tune_each(machine, trial.y_d_mm, settings.dt_s, trial.extruding, shapers)
+        tuned = tune_each(machine, trial.y_d_mm, _DT_S, trial.extruding, shapers)
     curves = (trial.uncompensated(), *own.values(), *(trial.shaped(tuned[k]) for k in shapers))
     chosen, row = made.by_mode.get(made.mode), made.row
     limit = next((d.accel_limits_mm_s2(trial.y_d_mm)[row] for d in made.by_mode.values()), None)
@@ -126,8 +111,9 @@ def design_report(
             "machine": machine.name,
             "machine_title": machine.title,
             "machine_revision": machine.revision,
-            "frequencies": _frequencies(machine, axis, settings.dt_s),
-            **made.figures(settings),
+            "frequencies": _frequencies(machine, axis),
+            "basis": basis,
+            **made.figures(),
             "chosen": chosen.rungs[row] if chosen and made.mode in own else None,
             "path_peak_accel_mm_s2": path_peak,
             "path_rms_accel_mm_s2": path_rms,
@@ -164,94 +150,71 @@ class _Designed:
     lifted: LiftedWindow
     ladder: tuple[RungFigures, ...]
 
-    def figures(self, settings: DesignSettings) -> dict[str, Any]:
+    def figures(self) -> dict[str, Any]:
         """Return the figures of the report."""
         plants, lifted = self.plants, self.lifted
-        window = round(settings.window_s / settings.dt_s)
         guarded = lifted.weights if self.mode == "minimax" else plants.weights
-        chosen = self.by_mode.get(self.mode)
         return {
             "axis": AXES[self.row],
-            "basis": settings.basis,
             "robust": self.robust,
-            "along": chosen.along if chosen else settings.along or 1.0,
-            "sampling_s": settings.dt_s,
-            "window_s": settings.window_s,
-            "update_s": settings.update_s,
+            "sampling_s": _DT_S,
+            "window_s": WINDOW_S,
+            "update_s": UPDATE_S,
             "plant": _plant(plants, self.by_mode.get("minimax"), self.row),
-            "lifted": _singular_values(lifted.plants, lifted.weights, window),
-            "metrics": _metrics(plants, guarded, window),
+            "lifted": _singular_values(lifted.plants, lifted.weights),
+            "metrics": _metrics(plants, guarded),
             "ladder": self.ladder,
         }
 
 
-def _designed(machine: Machine, axis: str, settings: DesignSettings) -> _Designed:
-    _check_names(axis, settings)
-    dt_s, row = settings.dt_s, AXES.index(axis)
+def _designed(machine: Machine, axis: str, basis: str, robust: str) -> _Designed:
+    _check_names(axis, basis, robust)
+    row = AXES.index(axis)
     spec = machine.axes["x" if axis == "x" else "y"]
     # As in `PreviewFbf`, designs ignore delays of slow motion.
-    plants = plant_set(spec.without_delay(), dt_s)
-    by_mode, missing = _designers(machine, settings)
-    robust = _robust_mode(machine, settings, by_mode)
+    plants = plant_set(spec.without_delay(), _DT_S)
+    by_mode, missing = _designers(machine, basis)
+    if robust == "auto":
+        # As in jobs: if the set is refused, design for the nominal plants.
+        mode = design_mode(machine)
+        robust = mode if mode in by_mode else "off"
     # Without a set all robust modes are equal.
     mode = robust if robust in by_mode or len(plants.members) > 1 else "off"
     if mode in by_mode:
         lifted = by_mode[mode].lifted[row]
     else:
-        window, update = (round(s / dt_s) for s in (settings.window_s, settings.update_s))
         # Refused entirely: the figures say why.
         members, weights = plants.members, plants.weights
         if mode == "off":
             members, weights = (plants.nominal,), np.ones(1)
-        lifted = lifted_window(members, weights, window, update)
+        lifted = lifted_window(members, weights, _WINDOW, _UPDATE)
     # If the compensator is refused entirely, none of its rungs can be used.
     whole = next((text for text in missing if text.startswith(f"fbf {mode}: ")), None)
-    most = functions_within(spec.band_hz, dt_s)
-    ladder = _ladder(plants, lifted, settings.basis, dt_s, whole, most)
+    most = functions_within(spec.band_hz, _DT_S)
+    ladder = _ladder(plants, lifted, basis, whole, most)
     return _Designed(plants, row, by_mode, missing, robust, mode, lifted, ladder)
 
 
-def _check_names(axis: str, settings: DesignSettings) -> None:
+def _check_names(axis: str, basis: str, robust: str) -> None:
     for what, given, known in (
         ("axis", axis, AXES),
-        ("basis", settings.basis, tuple(BASES)),
-        ("robust mode", settings.robust, ("auto", *ROBUST)),
+        ("basis", basis, tuple(BASES)),
+        ("robust mode", robust, ("auto", *ROBUST)),
     ):
         if given not in known:
             raise DesignError(f"no {what} is called {given!r}; there are {', '.join(known)}")
 
 
-def _designers(
-    machine: Machine, settings: DesignSettings
-) -> tuple[dict[str, PreviewFbf], list[str]]:
+def _designers(machine: Machine, basis: str) -> tuple[dict[str, PreviewFbf], list[str]]:
     """Return the compensators of all distinct robust modes, and why others are missing."""
     sets = any(len(axis.weighted_members()) > 1 for axis in machine.axes.values())
     made, missing = {}, []
     for mode in ROBUST if sets else ROBUST[:1]:
         try:
-            made[mode] = PreviewFbf(
-                machine,
-                settings.dt_s,
-                robust=mode,
-                basis=settings.basis,
-                along=settings.along,
-                window_s=settings.window_s,
-                update_s=settings.update_s,
-            )
+            made[mode] = PreviewFbf(machine, _DT_S, robust=mode, basis=basis)
         except DesignError as error:
             missing.append(f"fbf {mode}: {error}")
     return made, missing
-
-
-def _robust_mode(
-    machine: Machine, settings: DesignSettings, designers: Mapping[str, PreviewFbf]
-) -> str:
-    """Return the requested mode; for ``auto``, the one that jobs use."""
-    if settings.robust != "auto":
-        return settings.robust
-    mode = design_mode(machine)
-    # As in jobs: if the set is refused, design for the nominal plants.
-    return mode if mode in designers else "off"
 
 
 def _own_curves(
@@ -297,9 +260,9 @@ def _plant(plants: PlantSet, guarded: PreviewFbf | None, row: int) -> AxisFigure
     )
 
 
-def _frequencies(machine: Machine, axis: str, dt_s: float) -> Frequencies:
+def _frequencies(machine: Machine, axis: str) -> Frequencies:
     spec = machine.axes["x" if axis == "x" else "y"]
-    plants = plant_set(spec.without_delay(), dt_s)
+    plants = plant_set(spec.without_delay(), _DT_S)
     responses = [p.frequency_response(_FREQUENCIES_HZ) for p in (plants.nominal, *plants.members)]
     gain = np.abs(responses)
     phase_deg = np.degrees(np.unwrap(np.angle(responses), axis=1))
@@ -316,35 +279,33 @@ def _modes(plant: DiscretePlant) -> tuple[ModeFigures, ...]:
     return tuple(ModeFigures(f_hz=float(f), zeta=float(zeta)) for f, zeta in plant.modes())
 
 
-def _singular_values(
-    members: Sequence[DiscretePlant], weights: Array, window: int
-) -> LiftedFigures:
+def _singular_values(members: Sequence[DiscretePlant], weights: Array) -> LiftedFigures:
     """Return the singular values of the stack of sqrt(l_j) G_j; for one plant, its own."""
-    markov = np.array([p.impulse_response(window) for p in members])
+    markov = np.array([p.impulse_response(_WINDOW) for p in members])
     roots = np.sqrt(weights)
     position, increments = (
         np.linalg.svd(
-            np.concatenate([r * lift(h, window).dense() for r, h in zip(roots, rows, strict=True)]),
+            np.concatenate([r * lift(h, _WINDOW).dense() for r, h in zip(roots, hs, strict=True)]),
             compute_uv=False,
         )
-        for rows in (markov, integrated(markov))
+        for hs in (markov, integrated(markov))
     )
     return LiftedFigures(
-        samples=window, position=tuple(position.tolist()), increments=tuple(increments.tolist())
+        samples=_WINDOW, position=tuple(position.tolist()), increments=tuple(increments.tolist())
     )
 
 
-def _metrics(plants: PlantSet, weights: Array, window: int) -> Metrics:
+def _metrics(plants: PlantSet, weights: Array) -> Metrics:
     """Return the closed forms of the nominal plant, and of the set if there is one."""
-    own = _singular_values((plants.nominal,), np.ones(1), window)
+    own = _singular_values((plants.nominal,), np.ones(1))
     per_um = plants.dt_s**-2 / 1e3
     robust = []
     if len(plants.members) > 1:
-        members = _increments(plants.members, weights, window)
-        nominal = _increments((plants.nominal,), np.ones(1), window).mean
+        members = _increments(plants.members, weights)
+        nominal = _increments((plants.nominal,), np.ones(1)).mean
         robust = [_robust(members, "plant", nominal), _robust(members, "optimum", None)]
     return Metrics(
-        error=tuple(error_of_functions(n, window) for n in range(1, window + 1)),
+        error=tuple(error_of_functions(n, _WINDOW) for n in range(1, _WINDOW + 1)),
         effort_position=_effort(own.position, 1.0),
         effort_increments=_effort(own.increments, per_um),
         robust=tuple(robust),
@@ -376,8 +337,8 @@ def _robust(members: LiftedSet, name: str, nominal: Array | None) -> RobustMetri
     )
 
 
-def _increments(members: Sequence[DiscretePlant], weights: Array, window: int) -> LiftedSet:
-    markov = np.array([p.impulse_response(window) for p in members])
+def _increments(members: Sequence[DiscretePlant], weights: Array) -> LiftedSet:
+    markov = np.array([p.impulse_response(_WINDOW) for p in members])
     return lifted_set(integrated(markov), weights)
 
 
@@ -385,33 +346,30 @@ def _ladder(
     plants: PlantSet,
     lifted: LiftedWindow,
     basis: str,
-    dt_s: float,
     refused: str | None,
     most: int,
 ) -> tuple[RungFigures, ...]:
-    window = lifted.window
-    nominal = _increments((plants.nominal,), np.ones(1), window)
+    nominal = _increments((plants.nominal,), np.ones(1))
     every = None
     if len(plants.members) > 1:
-        every = _increments(plants.members, plants.weights, window)
+        every = _increments(plants.members, plants.weights)
     # The same designs as in jobs.
     weights = tuple(lifted.weights.tolist())
-    table = designs(lifted.plants, weights, window, lifted.update, basis, most)
+    table = designs(lifted.plants, weights, _WINDOW, _UPDATE, basis, most)
     rungs = range(len(table.ladder))
-    return tuple(_rung(k, table, dt_s, nominal, every, refused) for k in rungs)
+    return tuple(_rung(k, table, nominal, every, refused) for k in rungs)
 
 
 def _rung(
     number: int,
     table: Designs,
-    dt_s: float,
     nominal: LiftedSet,
     every: LiftedSet | None,
     refused: str | None,
 ) -> RungFigures:
     rung, lifted = table.ladder[number], table.lifted
-    n = max(4, round(rung.n * lifted.window / 300))
-    cutoff_hz = n / (2 * lifted.window * dt_s)
+    n = max(4, round(rung.n * _WINDOW / 300))
+    cutoff_hz = n / (2 * WINDOW_S)
     try:
         design = table.design(number)
     except DesignError as error:
@@ -428,5 +386,5 @@ def _rung(
         condition=design.condition,
         error=robust_error_metric(nominal, controller),
         robust_error=None if every is None else robust_error_metric(every, controller),
-        effort=effort_metric(controller) / dt_s**2 / 1e3,
+        effort=effort_metric(controller) / _DT_S**2 / 1e3,
     )

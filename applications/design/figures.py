@@ -188,7 +188,6 @@ class DesignReport(Document):
     axis: Literal["x", "y"]
     basis: BasisName
     robust: RobustMode
-    along: float
     sampling_s: float
     window_s: float
     update_s: float

@@ -48,10 +48,8 @@ class PinnedMachine(Document):
             os.fsync(opened.fileno())
 
     @classmethod
-    def read(cls, file: Path, name: str) -> PinnedMachine:
-        """Read it; without a file (a job of an earlier version) the built-in machine `name`."""
-        if not file.exists():
-            return cls(machine=load_machine(name))
+    def read(cls, file: Path) -> PinnedMachine:
+        """Read a file of `write`."""
         try:
             return cls.model_validate_json(file.read_bytes())
         except ValidationError as error:

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillpath.applications.controllers.loading import LoadedController
-from stillpath.applications.controllers.options import Disturbance
 from stillpath.applications.controllers.response import answer, disturbance_of, disturbance_text
 from stillpath.applications.scanning.figures import ScanReport, TrackFigures, VariantFigures
 from stillpath.compensation.base import DesignError
@@ -25,7 +24,7 @@ from stillpath.compensation.feedback.zero_phase import design_prefilter
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.hatches import Hatches, ScanSamples, Timing, read_hatches, sample_hatches
 from stillpath.models.diagrams import Block
-from stillpath.models.disturbances import sample
+from stillpath.models.disturbances import DisturbanceSpec, sample
 from stillpath.models.loops import Loop, LoopSpec
 from stillpath.simulation.closed_loop import simulate
 from stillpath.simulation.scanning import TrackErrors, track_errors
@@ -65,7 +64,7 @@ class ScanSettings:
     prefilter: Prefiltering = "zpetc"
     cutoff_hz: float | None = None
     timing: Timing = field(default_factory=Timing)
-    disturbance: Disturbance | None = None
+    disturbance: DisturbanceSpec | None = None
     enters: Literal["output", "input"] | None = None
     disturbance_um: float = 10.0
 

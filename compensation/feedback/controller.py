@@ -7,7 +7,6 @@ controllers. The blocks read ym, u, v, r of `models.loops` and write c.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -200,15 +199,11 @@ class Controller:
             document["add_on_db"] = _db(p.add_on).tolist()
         return document
 
-    def to_json(self, *, curves: bool = False) -> str:
-        """Return `to_dict` as JSON text."""
-        return json.dumps(self.to_dict(curves=curves), indent=2) + "\n"
-
     def to_c_header(self) -> str:
         """Return the coefficients as a C header (C99, no dependency).
 
         Its comment lists the signals and the order of computation; the coefficients of every filter
-        named there are in `to_json` under difference_equations.
+        named there are in `to_dict` under difference_equations.
         """
         guard = f"STILLPATH_{_identifier(self.method)}_{_identifier(self.machine)}_H".upper()
         prefix = _identifier(self.method).lower()

@@ -51,9 +51,9 @@ from stillpath.models.identification.readers import (
 from stillpath.models.identification.sets import (
     Origin,
     delay_warning,
+    model_file_set,
     response_set,
     spectrum_set,
-    typed_in_set,
 )
 from stillpath.models.identification.spectrum_fit import (
     Explanations,
@@ -245,7 +245,7 @@ class _AxisWork:
             raise ModelError(f"axis {self._axis}: {len(self._used)} models ({names}); give one")
         model = self._used[0].measurement
         assert isinstance(model, PlantModel)
-        plants = typed_in_set(model.spec, kind="model file")
+        plants = model_file_set(model.spec)
         if plants.provenance is not None:
             about = plants.provenance.model_copy(update={"sources": self._origin.sources})
             plants = plants.model_copy(update={"provenance": about})

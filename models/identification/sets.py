@@ -41,12 +41,12 @@ __all__ = [
     "Origin",
     "delay_warning",
     "measured_modes",
+    "model_file_set",
     "parametric_members",
     "plant_set_from",
     "provenance_of",
     "response_set",
     "spectrum_set",
-    "typed_in_set",
 ]
 
 Array = NDArray[np.float64]
@@ -57,7 +57,6 @@ PARAMETRIC_SPREAD: dict[str, tuple[float, float]] = {
     "recorded drive": (0.02, 0.20),
     "spectrum": (0.03, 0.50),
     "model file": (0.02, 0.20),
-    "typed in": (0.07, 0.50),
 }
 """Relative spread of frequencies and of damping ratios where there is one measurement: repeats on
 real axes differ by 0.7 % and 12 % within a session, by 2 % over weeks; damping from a spectrum
@@ -216,8 +215,9 @@ def plant_set_from(
     )
 
 
-def typed_in_set(spec: PlantSpec, *, kind: Kind = "typed in") -> PlantSetSpec:
-    """Return the set of a plant that was not measured here: typed in, or read from a file."""
+def model_file_set(spec: PlantSpec) -> PlantSetSpec:
+    """Return the set of a plant that was not measured here but read from a file."""
+    kind: Kind = "model file"
     return PlantSetSpec(
         nominal=spec, members=parametric_members(kind), provenance=Provenance(kind=kind)
     )

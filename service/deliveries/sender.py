@@ -16,7 +16,6 @@ from stillpath.applications.machines.resolve import PinnedMachine
 from stillpath.compensation.defaults import DEFAULT_METHOD
 from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
-from stillpath.models.store import load_machine
 from stillpath.service.database.engine import DatabaseAway
 from stillpath.service.deliveries import rows
 from stillpath.service.deliveries.checking import Checker, PrinterUnknown
@@ -242,7 +241,7 @@ class Sender:
         except TargetRefused as error:
             return "failed", str(error)
         except FileNotFoundError:
-            return "failed", "the result is gone"
+            return "failed", "the files of the job are gone"
         except (Unreached, StorageError) as error:
             return "waiting", str(error)
         except Unanswered as error:
@@ -306,11 +305,8 @@ class Sender:
 
     def _machine(self, job: Job) -> Machine:
         """Return the machine that the job was done with."""
-        try:
-            with self._storage.local(job.machine_file) as file:
-                return PinnedMachine.read(file, job.machine).machine
-        except FileNotFoundError:  # a job of an earlier version
-            return load_machine(job.machine)
+        with self._storage.local(job.machine_file) as file:
+            return PinnedMachine.read(file).machine
 
 
 @contextlib.contextmanager

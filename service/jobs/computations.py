@@ -61,12 +61,13 @@ def _identify(task: Task, progress: ProgressCallback) -> None:
 
 def _design(task: Task, progress: ProgressCallback) -> None:
     """Write the report of the design of one axis; options: `axis`, `basis`, `robust`."""
-    from stillpath.applications.design.design import DesignSettings, design_report
+    from stillpath.applications.design.design import design_report
 
     progress_to(progress, "designing", 0.0)(0.0)
     asked = task.options
-    settings = DesignSettings(basis=asked["basis"], robust=asked["robust"])
-    report = design_report(task.pinned().machine, asked["axis"], settings)
+    report = design_report(
+        task.pinned().machine, asked["axis"], basis=asked["basis"], robust=asked["robust"]
+    )
     _write(task, report.model_dump(mode="json"))
 
 

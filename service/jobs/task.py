@@ -59,7 +59,7 @@ class Task:
         """
         from stillpath.applications.machines.resolve import PinnedMachine
 
-        return PinnedMachine.read(self.machine_file, self.machine)
+        return PinnedMachine.read(self.machine_file)
 
 
 Runner = Callable[[Task, Callable[[Progress], None]], dict[str, Any]]

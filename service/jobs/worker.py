@@ -292,13 +292,12 @@ def _work(job: Job, workplace: Workplace, runner: Runner, watch: Watch, folder: 
         except FileNotFoundError:
             raise _InputBroken(input_gone(job.source_name)) from None
         # What a disk has cut or garbled may still look like G-code: half a print.
-        # (Trajectories that were asked for before this version name no digest.)
         if job.source_sha256 and sha256_of(sources[0]) != job.source_sha256:
             raise _InputBroken(input_damaged(job.source_name))
         try:
             machine = fetch(job.machine_file)
         except FileNotFoundError:
-            machine = folder / "machine.json"  # it needs none, or is a job of an earlier version
+            machine = folder / "machine.json"  # it needs none
         cache = workplace.settings.data_dir / "cache"
         cache.mkdir(parents=True, exist_ok=True)
         summary = runner(

@@ -156,9 +156,9 @@ def design(
     ------
     stillpath.compensation.base.DesignError, stillpath.models.errors.ModelError
     """
-    from stillpath.applications.design.design import DesignSettings, design_report
+    from stillpath.applications.design.design import design_report
 
-    return design_report(_machine(machine), axis, DesignSettings(basis=basis, robust=robust))
+    return design_report(_machine(machine), axis, basis=basis, robust=robust)
 
 
 def _machine(machine: Machine | str) -> Machine:

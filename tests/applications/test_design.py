@@ -16,7 +16,7 @@ from scipy.signal import dfreqresp
 from starlette.testclient import TestClient
 
 from stillpath.applications.design import design as module
-from stillpath.applications.design.design import DesignSettings, design_report
+from stillpath.applications.design.design import design_report
 from stillpath.applications.design.figures import DesignReport
 from stillpath.applications.design.page import render_design, write_design
 from stillpath.applications.design.summary import Summary
@@ -74,7 +74,7 @@ def report_of(machine: Machine, **settings: Any) -> DesignReport:
         "tuned": TUNED,
     }
     given |= {name: settings.pop(name) for name in given if name in settings}
-    return design_report(machine, settings.pop("axis", "x"), DesignSettings(**settings), **given)
+    return design_report(machine, settings.pop("axis", "x"), **settings, **given)
 
 
 @pytest.fixture(scope="module")
@@ -410,14 +410,14 @@ def test_command(
 ) -> None:
     asked = []
 
-    def pretended(machine: Machine, axis: str, settings: DesignSettings) -> DesignReport:
+    def pretended(machine: Machine, axis: str, **settings: str) -> DesignReport:
         asked.append((machine.name, axis, settings))
         return off
 
     monkeypatch.setattr(module, "design_report", pretended)
     command = ["design", "-m", "ender3", "--axis", "x", "--robust", "off"]
     assert run([*command, "--report", str(tmp_path / "d")]) == 0
-    assert asked == [("ender3", "x", DesignSettings(basis="ce-opt", robust="off"))]
+    assert asked == [("ender3", "x", {"basis": "ce-opt", "robust": "off"})]
     assert (tmp_path / "d" / "design.html").exists()
     shown = capsys.readouterr().out
     for words in ("rho(F)", "fbf minimax", "singular values", "remark 4.5", "n 90"):

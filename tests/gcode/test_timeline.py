@@ -114,16 +114,6 @@ def test_moving_and_rows(piece: Piece) -> None:
     assert np.mean(line.moving & still) < 0.02
 
 
-def test_standing_after_the_end(piece: Piece) -> None:
-    short, long = timeline(piece), timeline(piece, end_s=0.15)
-    n = short.position_mm.shape[1]
-    assert long.position_mm.shape[1] == n + 150
-    np.testing.assert_array_equal(long.position_mm[:, :n], short.position_mm)
-    np.testing.assert_allclose(
-        long.position_mm[:, n:].T, np.tile(piece.moves.end_mm[-1], (150, 1)), atol=1e-9
-    )
-
-
 def test_a_stretch_of_no_time_has_a_sample(piece: Piece) -> None:
     """Marlin swallows a move of less than a step; a segment must be able to end after it."""
     rows = Phases(**{f.name: getattr(piece.phases, f.name)[:1] for f in fields(Phases)})

@@ -208,7 +208,7 @@ def test_only_approved_revisions_where_that_is_switched_on(tmp_path: Path):
 
 
 def pinned(folder: Path, job: dict[str, Any]) -> PinnedMachine:
-    return PinnedMachine.read(folder / "jobs" / job["id"] / "machine.json", job["machine"])
+    return PinnedMachine.read(folder / "jobs" / job["id"] / "machine.json")
 
 
 @pytest.mark.slow

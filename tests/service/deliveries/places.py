@@ -9,6 +9,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from stillpath.applications.machines.resolve import PinnedMachine
+from stillpath.models.store import load_machine
 from stillpath.service.database.engine import open_database
 from stillpath.service.deliveries.checking import Checker
 from stillpath.service.deliveries.printers import load_printers
@@ -61,6 +63,8 @@ class Place:
         self.store.apply(job.id, Claimed(time.time(), "worker"))
         output = f"jobs/{job.id}/1"
         file = folder / job.id
+        PinnedMachine(machine=load_machine(job.machine)).write(file)
+        self.storage.put(job.machine_file, file)
         file.write_bytes(RESULT)
         self.storage.put(f"{output}/result/{job.result_name}", file)
         digest = hashlib.sha256(RESULT).hexdigest()
