@@ -108,7 +108,6 @@ def _error_table(result: Result) -> Table:
 
 
 def _way_line(way: PrintWay) -> str:
-    """Return what is predicted for a way to print."""
     range_um = way.contour_range_um
     plants = "" if range_um is None else f", all plants {range_um[0]:.2f} - {range_um[1]:.2f}"
     return (
@@ -145,7 +144,6 @@ def budget_line(budget: BudgetFigures) -> str:
 
 
 def _advice_line(advice: AdviceFigures) -> str:
-    """Return what is advised."""
     shapers = "; ".join(
         f"{'' if one.layer <= 0 else f'from layer {one.layer} on '}{one.label}"
         for one in advice.shapers

@@ -95,8 +95,8 @@ def list_jobs(
         table.add_column(column, no_wrap=column != "file")
     for job in found:
         made = job.created_at.astimezone().strftime("%Y-%m-%d %H:%M")
-        state_shown = f"{job.state.value} {100 * job.progress:.0f} %" if _runs(job) else job.state
-        table.add_row(job.id, state_shown, job.machine, job.source_name, made)
+        share = f" {100 * job.progress:.0f} %" if job.state.value == "running" else ""
+        table.add_row(job.id, f"{job.state.value}{share}", job.machine, job.source_name, made)
     Console(highlight=False, markup=False, soft_wrap=True).print(table)
 
 
@@ -213,10 +213,6 @@ def _print_figures(report: dict[str, Any]) -> None:
         sys.stdout.write("done; the figures are in the report\n")
     else:
         print_result(result)
-
-
-def _runs(job: JobView) -> bool:
-    return job.state.value == "running"
 
 
 def _numbers(read: Any) -> Any:

@@ -67,7 +67,7 @@ class AxisTravel(Document):
 
 
 class AxisLimits(Document):
-    """What an axis bears, where it is more than `CommandLimits` says of both; None: the same."""
+    """Limits of one axis, where they exceed those of `CommandLimits`; None: the same."""
 
     velocity_mm_s: _Speed | None = None
     accel_mm_s2: _Accel | None = None

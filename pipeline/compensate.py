@@ -97,7 +97,6 @@ def _rewrite(
     layers: Path | None,
     trace: Callable[[Trace], None] | None,
 ) -> Result:
-    """Put a compensated file in its place."""
     plate, progress = order.options.plate, order.progress
     opened = file_rewriting(source, target, plate=plate, layers=layers, progress=progress)
     with opened as file:

@@ -255,7 +255,6 @@ class Job:
         self.retiming.copy(self._target, text, self.delay_s)
 
     def _chosen_paces(self, size: int) -> SpeedBudget:
-        """Choose the paces of the print."""
         self._source.seek(0)
         with self._clock.stage("budget"):
             found = take_samples(

@@ -217,7 +217,6 @@ class _Trial:
                 yield _Candidate(cost(shares), corner_hz, self._mixed(exact, shares), shares)
 
     def _mixed(self, exact: Array, shares: Shares) -> Array:
-        """Return the taps mixed with the shaper's."""
         a = np.array(shares)[:, None]
         padding = (self._smooth_taps.shape[1] - exact.shape[1]) // 2
         exact = np.pad(exact, ((0, 0), (padding, padding)))

@@ -78,8 +78,8 @@ class Options(BaseModel):
         description="`fbf` (limited-preview filtered basis functions), `npz-ignore`, `zmetc`, "
         "`zpetc`, `ebzpetc`, `ts` (approximate inverses), `shaper:NAME` (zv, mzv, ei, 2hump_ei, "
         "3hump_ei) or `none`; with `+ripple` appended the machine's ripple is undone as well. "
-        "`advise` leaves all moves as they are and adds firmware commands. `live` leaves the file "
-        "as it is, which is then the result too, and predicts the compensation inside Klipper.",
+        "`advise` leaves all moves as they are and adds firmware commands. `live` returns the "
+        "file as it is, and predicts the compensation inside Klipper.",
     )
     basis: BasisName = Field(default=DEFAULT_BASIS, description="Basis functions of `fbf`.")
     robust: RobustMode = Field(
@@ -132,8 +132,8 @@ class Options(BaseModel):
     )
     compare_live: bool = Field(
         default=False,
-        description="Whether the report of a compensated file also says what the compensation "
-        "inside Klipper would make of the sliced file. The print is planned once more for it.",
+        description="Also predict the sliced file with the compensation inside Klipper; this "
+        "plans the print a second time.",
     )
 
     @property

@@ -328,7 +328,6 @@ class PieceCompensator:
 def _designed(
     machine: Machine, options: Options, shaper: BestShaper | None, caution: Caution | None
 ) -> Compensator:
-    """Return the compensator that the options ask for."""
     if options.vibration == "fbf":
 
         def design(robust: str) -> Compensator:

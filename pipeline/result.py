@@ -47,12 +47,12 @@ class ErrorFigures(_Figures):
 
 
 class Channel(_Figures):
-    """One way to drive the machine: as the file came, compensated, or with the best shaper."""
+    """One way to drive the machine: as sliced, compensated, or with the best shaper."""
 
     name: str
     """`before`, `after` or `shaper`."""
     label: str
-    """The same for a person."""
+    """The same, for display."""
     extruding: ErrorFigures
     """While something is extruded [um]."""
     contour_range_um: tuple[float, float] | None = None
@@ -79,7 +79,7 @@ class GroupFigures(_Figures):
     name: str
     """Number of the layer from 0, or the slicer's name of the feature."""
     title: str
-    """The same for a person."""
+    """The same, for display."""
     seconds: float
     """Time in which it is extruded [s]."""
     contour_rms_um: dict[str, float]
@@ -100,7 +100,7 @@ class PutBack(_Figures):
     extruding_seconds: float
     """How much of that it extrudes [s]."""
     reason: str
-    """Why, for a person."""
+    """The reason, as text."""
 
 
 class Track(_Figures):
@@ -161,7 +161,7 @@ class BudgetClass(_Figures):
     """The slicer's name of the feature, `travel`, or `all that stays as sliced`: the first layer,
     and lines that stay as sliced."""
     title: str
-    """The same for a person."""
+    """The same, for display."""
     acceleration_factor: float
     """Ratio of its accelerations to the file's, before the machine's limits; 1: as in the file."""
     shaper_acceleration_factor: float
@@ -175,7 +175,7 @@ class BudgetClass(_Figures):
 
 
 class BudgetFigures(_Figures):
-    """What a budget of contour error bought."""
+    """What a contour error budget gained."""
 
     budget_um: float
     """Contour error that every feature may have [um]."""
@@ -200,21 +200,21 @@ class BudgetFigures(_Figures):
 
 
 class AdvisedShaper(_Figures):
-    """A firmware shaper that is advised."""
+    """An advised firmware shaper."""
 
     layer: int
-    """From which layer on; the first holds from the beginning of the file."""
+    """First layer; the first shaper holds from the beginning of the file."""
     label: str
-    """Type and frequencies for a person."""
+    """Type and frequencies, for display."""
 
 
 class AdvisedFeature(_Figures):
-    """What is advised for one feature, and what it does."""
+    """Advice for one feature, and its effect."""
 
     name: str
     """The slicer's name of the feature, or `unnamed`."""
     title: str
-    """The same for a person."""
+    """The same, for display."""
     accel_mm_s2: float | None
     """Acceleration [mm/s^2]; null: as the file has it."""
     exact: bool
@@ -223,7 +223,7 @@ class AdvisedFeature(_Figures):
     """Contour error that it may have, root mean square of the worst plant of the machine's set
     [um]; null where the file's accelerations are kept whatever they do."""
     within_bound: bool
-    """Whether it has no more."""
+    """Whether it keeps the bound."""
     before_um: float
     """Contour error as sliced, root mean square of the worst plant of the machine's set [um]."""
     after_um: float
@@ -235,7 +235,7 @@ class AdvisedFeature(_Figures):
 
 
 class AdviceFigures(_Figures):
-    """What is advised for a file: firmware commands among its lines."""
+    """Advice for a file: firmware commands inserted into it."""
 
     before_shaper: str
     """The firmware's shaper before the file's first line, as the machine states it."""
@@ -244,7 +244,7 @@ class AdviceFigures(_Figures):
     features: list[AdvisedFeature]
     """By feature."""
     lines: int
-    """Lines that were added."""
+    """Number of lines added."""
 
 
 class LastCheckFigures(_Figures):
@@ -278,9 +278,9 @@ class PrintWay(_Figures):
     file_bytes: int
     """Size of the file to print [bytes]."""
     needs: list[str]
-    """What it needs, for a person."""
+    """Requirements, as text."""
     lacks: list[str]
-    """What it does not do, for a person."""
+    """Limitations, as text."""
 
 
 class Result(_Figures):
@@ -291,7 +291,7 @@ class Result(_Figures):
     machine: str
     """Name of the machine."""
     machine_title: str
-    """The machine's name for a person."""
+    """The machine's name, for display."""
     machine_revision: str
     """Digest of the machine's document: the same digest, the same model."""
     settings: dict[str, str | float]
@@ -299,7 +299,7 @@ class Result(_Figures):
     source_name: str
     """Name of the file."""
     channels: list[Channel]
-    """Figures of the whole print."""
+    """Figures of the whole print, by channel."""
     best_shaper: str
     """The best-tuned firmware shaper of this machine, with its frequencies [Hz]."""
     original_time_s: float
@@ -329,7 +329,7 @@ class Result(_Figures):
     emission_max_um: float
     """Written motion against computed command, largest [um]."""
     filament_error_mm: float
-    """Filament of a piece against the original's, largest [mm]."""
+    """Largest difference between a piece's filament and the original's [mm]."""
     compensated_s: float
     """Time of the pieces that are compensated [s]."""
     extruding_s: float
@@ -337,7 +337,7 @@ class Result(_Figures):
     pieces: int
     """Pieces that the file was cut into."""
     put_back: list[PutBack]
-    """Those that stayed as sliced, in order."""
+    """Pieces that stayed as sliced, in order."""
     put_back_extruding_share: float
     """Their share of the extruding time, 0 to 1."""
     left_alone_s: float = 0.0
@@ -350,9 +350,9 @@ class Result(_Figures):
     left_out_extruding_s: float = 0.0
     """How much of that extrudes [s]."""
     warnings: list[str]
-    """What asks for attention, for a person."""
+    """Warnings, as text."""
     notes: list[str] = []
-    """What is worth knowing and no trouble, for instance how plants followed a schedule."""
+    """Notes that need no action, for instance how plants followed a schedule."""
     confirmation: str = ""
     """What ring tests on the machine said of its model; empty where nothing was compensated."""
     layers: list[GroupFigures]
@@ -368,14 +368,14 @@ class Result(_Figures):
     stages: list[StageTime]
     """CPU time by stage."""
     budget: BudgetFigures | None = None
-    """What the budget bought, where there was one."""
+    """What the contour error budget gained, if there was one."""
     advice: AdviceFigures | None = None
-    """What is advised, by method `advise`."""
+    """Advice of method `advise`."""
     ways: list[PrintWay] = []
-    """Both ways to print the file, where they were compared; the one, where it is to be printed
-    live; else empty."""
+    """Ways to print the file: both if they were compared, one if it is to be printed live, else
+    none."""
     not_live: str = ""
-    """Why it cannot be printed live, where both ways were to be compared; empty: it can."""
+    """Why the file cannot be printed live, if a comparison was requested; empty: it can."""
     last_check: LastCheckFigures | None = None
     """What the last check compared; null where nothing was compensated."""
 

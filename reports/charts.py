@@ -163,17 +163,13 @@ def _named_ends(
     ends: Sequence[tuple[float, float, Line]], room: tuple[float, float], right: float
 ) -> Iterator[str]:
     """Yield names beside the ends (y, x) of lines, spread so that all are legible."""
-    ends = sorted(ends, key=_first)
+    ends = sorted(ends, key=lambda end: end[0])
     places = _spread([end[0] for end in ends], *room)
     for place, (y, x, line) in zip(places, ends, strict=True):
         yield (
             f'<path class="{line.style} lead" d="M{x:.1f} {y:.1f}L{right + 12:.1f} {place:.1f}"/>'
         )
         yield _text(right + _END_GAP - 3, place + 4, line.name, "start")
-
-
-def _first(end: tuple[float, float, Line]) -> float:
-    return end[0]
 
 
 def _shown(y: float, chart: Chart) -> bool:

@@ -106,7 +106,7 @@ class Revision(Document):
 
 
 class Approval(Document):
-    """Somebody's word that a revision may be used."""
+    """Approval of a revision for use in jobs."""
 
     number: Number
     content_sha256: Digest

@@ -122,7 +122,7 @@ def read_ring_motion(printed: Path, machine: Machine) -> RingMotion:
         speed = np.abs(np.diff(command[k], prepend=command[k, 0])) * RATE_HZ
         for half in ("off", "on"):
             stops += _stops(axis, half == "on", speed, own[half], own[half + REST])
-        quiet[axis] = _runs_s(own["quiet"])
+        quiet[axis] = [(first / RATE_HZ, end / RATE_HZ) for first, end in runs(own["quiet"])]
         about[axis] = np.any(list(own.values()), axis=0)
     stops.sort(key=lambda stop: stop.at_s)
     return RingMotion(
@@ -159,11 +159,6 @@ def _stops(
         fast = np.flatnonzero(own > _FAST * own.max())
         out.append(Stop(axis, compensated, (first + fast[-1]) / RATE_HZ, end / RATE_HZ, k % kinds))
     return out
-
-
-def _runs_s(inside: NDArray[np.bool_]) -> list[tuple[float, float]]:
-    """Return the time ranges in which a mask is true."""
-    return [(first / RATE_HZ, end / RATE_HZ) for first, end in runs(inside)]
 
 
 def _plants(printed: Path) -> dict[Axis, str]:

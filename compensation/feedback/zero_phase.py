@@ -101,7 +101,7 @@ def design_prefilter(
     ----------
     loop : Loop
     cutoff_hz : float, optional
-        Of the zero-phase FIR; None: no FIR (see `fir_within`).
+        Of the zero-phase FIR; None: no FIR.
     length : int
         l: the FIR looks l samples ahead.
 

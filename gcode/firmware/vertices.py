@@ -136,7 +136,6 @@ def vertices_on_steps(lattice: Lattice, timeline: Timeline, segments: Segments) 
 
 
 def _answer_of(errors: ErrorFilter | None) -> Answer:
-    """Return an `ErrorFilter` in real numbers."""
     pole, weight, direct = np.zeros((2, 1), complex), np.zeros((2, 1), complex), np.ones(2)
     if errors is not None:
         pole, weight, direct = errors.pole, errors.weight, errors.direct

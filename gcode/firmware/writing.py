@@ -224,7 +224,6 @@ class StreamWriter:
         return first[np.minimum(piece.events.move_index, len(piece.moves))]
 
     def _modes(self, piece: Piece, index: NDArray[np.int64]) -> _Modes:
-        """Return the modal state at every written move."""
         changes = piece.events.kind == EventKind.MODE
         first = np.concatenate([[0], index[changes]])
         states = [piece.modal_before]
@@ -334,7 +333,6 @@ class StreamWriter:
         return text
 
     def _reads(self, extruder_mm: float) -> None:
-        """Record the printer's E."""
         far = self._stream_commands.coarse_extruder and abs(extruder_mm) > _FAR_MM
         self._far_mm = extruder_mm if far else None
 

@@ -144,7 +144,6 @@ def facts_in(head: bytes, tail: bytes = b"") -> SlicerFacts:
 
 
 def _comments(text: bytes) -> bytes:
-    """Return the lines that are nothing but a comment."""
     return b"".join(_COMMENT.findall(b"\n" + text))
 
 

@@ -96,7 +96,6 @@ def explain_response(
 
 
 def _moved(plant: PlantSpec, frequency: float, damping: float) -> PlantSpec:
-    """Return the plant of a fit with other frequencies and damping."""
     assert isinstance(plant, (PairsSpec, RelativeModesSpec))
     return plant.scaled(frequency, damping)
 

@@ -256,7 +256,6 @@ class _Job:
         return max(was[feature].rms_um, 1e-3) if feature in was else np.inf
 
     def _write(self, choice: Choice, first_layer: FirstLayer) -> AdviceWriter:
-        """Write the advised text to the spool."""
         reader = Interpreter(self._machine, dialect=self._dialect)
         writer = AdviceWriter(
             self._adviser,
@@ -276,7 +275,6 @@ class _Job:
         shares: tuple[float, float],
         each: Callable[[ProgramBlock], None] = lambda _: None,
     ) -> TextMotion:
-        """Measure the motion of a text."""
         low, high = shares
         motion = TextMotion(
             file,

@@ -160,7 +160,8 @@ class AdviceWriter:
                 self._own_shaper[form] = code.strip()
                 self._shaper = None
         self._file = self._adviser.accel_mm_s2(block.limits[int(events.limits_id[row])])
-        if kind != EventKind.UNKNOWN and self._sets_accel(line):
+        sets_accel = self._adviser.sets_accel(line.decode("utf-8", "replace"))
+        if kind != EventKind.UNKNOWN and sets_accel:
             self._now = self._file
         return lead
 
@@ -229,9 +230,6 @@ class AdviceWriter:
     def _title(self, feature: int) -> str:
         found = feature_of(self._names[feature]) if feature >= 0 else None
         return found.value if found is not None else "print"
-
-    def _sets_accel(self, line: bytes) -> bool:
-        return self._adviser.sets_accel(line.decode("utf-8", "replace"))
 
 
 def write_advised(

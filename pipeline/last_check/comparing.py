@@ -429,7 +429,6 @@ class LastCheck:
         return _FILAMENT_MM / self._before.least_flow
 
     def _count(self, line: int) -> None:
-        """Count a compared line."""
         before, after = self._before.state, self._after.state
         unknown = before[at.X] + before[at.Y] + after[at.X] + after[at.Y]
         self._note(1, int(unknown != unknown), line, line)

@@ -65,7 +65,6 @@ class LayerViews:
 
 
 def _joined(first: LayerTile, second: LayerTile) -> LayerTile:
-    """Return two parts of a layer as one."""
     return replace(
         first,
         x_mm=np.append(first.x_mm, second.x_mm),

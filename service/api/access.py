@@ -26,7 +26,9 @@ from stillpath.service.settings import is_loopback
 
 __all__ = ["Admin", "Operator", "Reader", "Submitter", "Uploader", "Watcher"]
 
-_ABOUT = "A key of this service (`sp_...`). Not needed where the service answers its own computer."
+_ABOUT = (
+    "A key of this service (`sp_...`). Not needed if the service only answers its own computer."
+)
 _CHALLENGE = 'Bearer realm="stillpath"'
 
 _Bearer = Annotated[

@@ -53,8 +53,8 @@ _T = TypeVar("_T")
 WAITING: dict[int | str, dict[str, Any]] = {
     202: {
         "model": JobView,
-        "description": "It takes longer than the caller waits (`Prefer: wait=SECONDS`, at most "
-        "50). The job goes on; the same request, once it is done, is answered at once.",
+        "description": "Not done within `Prefer: wait=SECONDS` (at most 50). The job goes on; "
+        "repeat the request: once the job is done, it is answered at once.",
     }
 }
 """OpenAPI entry of routes whose answer is a job's."""

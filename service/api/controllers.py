@@ -51,7 +51,7 @@ async def list_loops(request: Request, caller: Reader) -> Any:
 async def design_controller(
     request: Request,
     name: Annotated[
-        str, Path(max_length=255, description="Of `/v1/loops`.", examples=["galvo-40khz"])
+        str, Path(max_length=255, description="A name from `/v1/loops`.", examples=["galvo-40khz"])
     ],
     options: Annotated[
         ControllerOptions,
@@ -59,7 +59,7 @@ async def design_controller(
     ],
     caller: Reader,
     format: Annotated[  # noqa: A002 - the parameter's name on the wire
-        Literal["json", "html", "c"] | None, Query(description="Goes before `Accept`.")
+        Literal["json", "html", "c"] | None, Query(description="Overrides `Accept`.")
     ] = None,
     accept: Annotated[str, Header()] = "*/*",
 ) -> Response:

@@ -60,7 +60,7 @@ async def watch_job(
     job_id: JobId,
     caller: Watcher,
     last_event_id: Annotated[
-        str | None, Header(description="Of the last event that came; browsers send it.")
+        str | None, Header(description="Id of the last event received; browsers send it.")
     ] = None,
 ) -> EventSourceResponse:
     """Send the job as it stands, then every change until it is over."""

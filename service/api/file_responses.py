@@ -21,14 +21,14 @@ MEDIA = {".csv": "text/csv", ".npz": "application/octet-stream", ".json": "appli
 """Kinds of answers, by the suffix of their file names."""
 
 HEADERS = {
-    "ETag": {"schema": {"type": "string"}, "description": "Names these bytes."},
+    "ETag": {"schema": {"type": "string"}, "description": "Identifies the content."},
     "Accept-Ranges": {"schema": {"type": "string"}},
 }
 """OpenAPI entries for the headers of a stored file."""
 
 RANGES: dict[int | str, dict[str, str]] = {
     206: {"description": "The part that `Range` names"},
-    304: {"description": "Not Modified: `If-None-Match` names these bytes"},
+    304: {"description": "Not Modified: `If-None-Match` names this content"},
 }
 """OpenAPI entries for the other answers a stored file can give."""
 

@@ -26,7 +26,8 @@ def show_response(
     name: str,
     _: Reader,
     revision: Annotated[
-        int | None, Query(ge=1, le=999_999, description="Of your own machine; else the newest.")
+        int | None,
+        Query(ge=1, le=999_999, description="Revision of your own machine; by default the newest."),
     ] = None,
 ) -> list[AxisResponse]:
     """Return modulus and phase of both axes: the nominal plant and the members of its set."""

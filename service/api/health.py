@@ -26,16 +26,16 @@ router = APIRouter(tags=["health"])
 
 @router.get("/healthz", summary="Liveness probe")
 async def healthz() -> Health:
-    """Answer as long as the process can."""
+    """Return `ok` while the process runs."""
     return Health(status="ok", version=__version__)
 
 
 @router.get("/readyz", responses=responses(503), summary="Readiness probe")
 async def readyz(request: Request) -> Health:
-    """Answer `ok` while database, storage, disk and workers do, else 503 and which does not.
+    """Return `ok` if database, storage, disk and workers respond; otherwise 503 and what does not.
 
-    Anybody may ask, as often as they like: the parts are asked once in two seconds, and why one
-    does not answer, which may name other computers, stands in the log.
+    No key is needed and requests are not limited: the parts are asked at most once in two seconds.
+    The reason, which may name other computers, is in the log.
     """
     part = await request.app.state.readiness.missing(request)
     if part is not None:

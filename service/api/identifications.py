@@ -57,7 +57,7 @@ _BODY = {
 
 
 class IdentificationView(BaseModel):
-    """What came of measurements; `revision` is null for a trial, which stores nothing."""
+    """Result of an identification; `revision` is null for a trial, which stores nothing."""
 
     revision: RevisionView | None
     report: IdentificationReport
@@ -73,13 +73,19 @@ class _Reading:
     max_freq: Annotated[float | None, Query(gt=0)] = None
     hz_per_sec: Annotated[float | None, Query(gt=0)] = None
     sweeping_accel: Annotated[float | None, Query(ge=0)] = None
-    firmware_date: Annotated[str | None, Query(description="Of the Klipper version.")] = None
-    sensor_axis: Annotated[str | None, Query(description="x, y or z")] = None
+    firmware_date: Annotated[str | None, Query(description="Date of the Klipper version.")] = None
+    sensor_axis: Annotated[
+        str | None, Query(description="Sensor axis along the tested axis: x, y or z.")
+    ] = None
     sensor_turned: bool = False
     frame_firm: bool = False
     repair_rounding: bool = False
-    dc_gain: Annotated[float | None, Query(gt=0, description="That a model may have.")] = None
-    sampling_s: Annotated[float | None, Query(gt=0, description="Of a discrete model.")] = None
+    dc_gain: Annotated[float | None, Query(gt=0, description="DC gain that a model may have.")] = (
+        None
+    )
+    sampling_s: Annotated[
+        float | None, Query(gt=0, description="Sampling time of a discrete model.")
+    ] = None
 
 
 _FIELDS = {
@@ -118,19 +124,19 @@ async def post_measurements(
     name: Name,
     caller: Uploader,
     settings: Annotated[ReadSettings, Depends(_settings)],
-    base: Annotated[
-        str | None, Query(description="What a machine that does not exist yet starts from.")
+    base: Annotated[str | None, Query(description="Machine that a new one is based on.")] = None,
+    title: Annotated[
+        str | None, Query(description="Display name of the machine.", max_length=200)
     ] = None,
-    title: Annotated[str | None, Query(description="Of the machine.", max_length=200)] = None,
     trial: Annotated[bool, Query(description="Store nothing.")] = False,
-    max_order: Annotated[int, Query(ge=1, le=8, description="Most modes to try.")] = 4,
+    max_order: Annotated[int, Query(ge=1, le=8, description="Largest number of modes to try.")] = 4,
     author: Author = None,
     message: Message = "",
 ) -> Any:
-    """Give the axes that were measured new plants, as a new revision of the machine.
+    """Identify the plants of the measured axes, and store them as a new revision of the machine.
 
-    Accepts resonance tests (raw or spectra), recorded drives, frequency responses and models. A
-    file that cannot be used is named with its reason, and nothing is stored.
+    Accepts resonance tests (raw or spectra), recorded drives, frequency responses and models. If a
+    file cannot be used, the answer names it and the reason, and nothing is stored.
     """
     machines: Resolver = request.app.state.machines
     if not trial:
@@ -249,7 +255,6 @@ async def _identified(
 
 
 async def _received(request: Request, folder: Path, disk: Disk) -> list[Received]:
-    """Return the files of a form."""
     if not is_form(request):
         raise Problem(
             422,

@@ -20,7 +20,7 @@ _ID = re.compile(r"[0-9a-f]{32}")
 JobId = Annotated[
     str,
     Path(
-        description="As the answer to the upload names it.",
+        description="The `id` in the response to the upload.",
         examples=["5f2c8e0e6c0d4a3f9d1b7a52c4e86f10"],
     ),
 ]

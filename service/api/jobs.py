@@ -111,7 +111,7 @@ async def list_jobs(
     status_code=202,
     response_model=JobView,
     responses={
-        200: {"model": JobView, "description": "The same job is there already"},
+        200: {"model": JobView, "description": "The same job exists already"},
         **responses(403, 408, 413, 422, 429, 507),
     },
     openapi_extra=upload_body(),
@@ -128,17 +128,17 @@ async def create_job(
             min_length=1,
             max_length=255,
             pattern=r"^[\x21-\x7e]+$",
-            description="Made by the caller for one request; the request can then be repeated "
-            "and makes one job. With another request the key is refused.",
+            description="Chosen by the caller for one request, which can then be repeated "
+            "without making a second job. With a different request the key is refused.",
             examples=["0f6a7f8e-2f0e-4d53-9f0e-5d4f2a1c9b7e"],
         ),
     ] = None,
 ) -> JobView:
-    """Store the file and put a job in the queue. The answer's `Location` is where to ask.
+    """Store the file and queue a job; `Location` is the job's address.
 
-    The parameters are checked before the body is read; whether the G-code can be processed is
-    found out by the job. A file that was done before, with the same machine, options and version,
-    is answered with that job (200), unless `fresh`, `webhook` or `printer` is given.
+    Parameters are checked before the body is read; the job finds out whether the G-code can be
+    processed. If the same file was done before, with the same machine, options and version, that
+    job is returned (200), unless `fresh`, `webhook` or `printer` is given.
     """
     if wanted.priority > 0 and not caller.may(Scope.ADMIN):
         raise Problem(
@@ -224,7 +224,6 @@ async def _changed(request: Request, caller: Caller, action: str, job_id: str) -
 
 
 async def _views(store: JobStore, jobs: Collection[Job]) -> list[JobView]:
-    """Return the jobs as their owner sees them."""
     positions: dict[str, int] = {}
     waiting = [job for job in jobs if job.state is JobState.QUEUED]
     if len(waiting) == 1:

@@ -42,7 +42,9 @@ class KeyCreate(BaseModel):
     )
 
     name: str = Field(min_length=1, max_length=120, description="What it is for.")
-    owner: str = Field(pattern=OWNER_PATTERN, description="Whose jobs its jobs are.")
+    owner: str = Field(
+        pattern=OWNER_PATTERN, description="Owner of the jobs that are submitted with it."
+    )
     scopes: list[Scope] = Field(min_length=1, max_length=8)
     expires_in_days: float | None = Field(
         default=None, gt=0, le=36500, allow_inf_nan=False, description="By default never."
@@ -52,7 +54,7 @@ class KeyCreate(BaseModel):
 class KeyView(BaseModel):
     """A key as lists show it."""
 
-    id: str = Field(description="Names the key; it opens nothing.")
+    id: str = Field(description="Identifies the key; it is not the secret.")
     name: str
     owner: str
     scopes: list[Scope]
@@ -74,11 +76,11 @@ class NewKey(KeyView):
 
 
 class AuditView(BaseModel):
-    """A row of the audit log."""
+    """An entry of the audit log."""
 
     id: int
     at: datetime
-    owner: str = Field(description="Who; `-` if nobody knows.")
+    owner: str = Field(description="Owner of the key; `-` if unknown.")
     key_id: str | None
     remote: str | None
     action: str
@@ -92,15 +94,15 @@ class AuditView(BaseModel):
 
 
 class AuditPage(BaseModel):
-    """Some rows of the audit log, the newest first."""
+    """Entries of the audit log, newest first."""
 
     entries: list[AuditView]
-    next_before: int | None = Field(description="`before` of the next page; null: that was all.")
+    next_before: int | None = Field(description="`before` of the next page; null: there is none.")
 
 
 @router.get("/keys", responses=responses(401, 403, 429), summary="List API keys")
 def list_keys(request: Request, caller: Admin) -> list[KeyView]:
-    """Return every key that was ever made, the oldest first; not the keys themselves."""
+    """Return all keys ever made, oldest first, without their secrets."""
     del caller
     return [KeyView.of(key) for key in _keys(request).list()]
 
@@ -112,7 +114,7 @@ def list_keys(request: Request, caller: Admin) -> list[KeyView]:
     summary="Create an API key",
 )
 def create_key(request: Request, response: Response, asked: KeyCreate, caller: Admin) -> NewKey:
-    """Make a key and show it, this once."""
+    """Create a key and return it. It cannot be shown again."""
     days = asked.expires_in_days
     try:
         key, secret = _keys(request).create(
@@ -143,7 +145,7 @@ def create_key(request: Request, response: Response, asked: KeyCreate, caller: A
     summary="Revoke an API key",
 )
 def revoke_key(request: Request, key_id: str, caller: Admin) -> Response:
-    """End a key at once and for good. It stays in the list."""
+    """Revoke a key permanently. It stays in the list."""
     key = _keys(request).revoke(key_id)
     if key is None:
         raise Problem(404, "No such key", f"There is no key {key_id[:32]!r}; GET /v1/keys.")
@@ -168,7 +170,7 @@ def read_audit(
         str | None, Query(max_length=64, description="For instance `submit` or `denied`.")
     ] = None,
 ) -> AuditPage:
-    """Return rows of the audit log, the newest first."""
+    """Return entries of the audit log, newest first."""
     del caller
     log: AuditLog = request.app.state.audit
     found = log.page(limit=limit + 1, before=before, action=action)

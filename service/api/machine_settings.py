@@ -31,7 +31,7 @@ _LARGEST_BYTES = 4_000_000
 _BODY = {
     "requestBody": {
         "required": True,
-        "description": "The text: Klipper's printer.cfg, or what Marlin answers to M503.",
+        "description": "Klipper's printer.cfg, or Marlin's output of M503.",
         "content": {"text/plain": {"schema": {"type": "string"}}},
     }
 }
@@ -52,14 +52,17 @@ class _Given:
         str,
         Query(
             max_length=60,
-            description="How far the axes reach in mm, which M503 does not say.",
+            description="Travel of the axes in mm, which is not in M503's output.",
             examples=["235x235x250"],
         ),
     ] = ""
     kinematics: Annotated[
-        str, Query(max_length=20, description="Of a Marlin printer: `cartesian` or `corexy`.")
+        str,
+        Query(
+            max_length=20, description="Kinematics of a Marlin printer: `cartesian` or `corexy`."
+        ),
     ] = "cartesian"
-    title: Annotated[str, Query(max_length=200, description="What people call it.")] = ""
+    title: Annotated[str, Query(max_length=200, description="Display name.")] = ""
     fx: Hertz = None
     fy: Hertz = None
 
@@ -83,10 +86,10 @@ async def put_settings(
     given: Annotated[_Given, Depends()],
     change: Annotated[Change, Depends()],
 ) -> RevisionView:
-    """Make a machine of a printer.cfg or of an answer to M503; its plants are still to be measured.
+    """Create a machine from a printer.cfg or M503's output; its plants are yet to be measured.
 
-    A machine that is there takes an answer to M503 (with `If-Match`, as of a PUT): what that does
-    not say stays.
+    An existing machine is updated from M503's output (with `If-Match`, as for PUT); what is not in
+    it stays.
     """
     content = await receive_document(request, max_bytes=_LARGEST_BYTES)
     file = safe_name(given.file)

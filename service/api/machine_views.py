@@ -29,7 +29,7 @@ class MachineSummary(BaseModel):
     origin: Literal["built in", "own"] = "built in"
     number: int | None = Field(default=None, description="Newest revision, if it is your own.")
     approved: int | None = Field(default=None, description="Newest approved revision.")
-    problem: str | None = Field(default=None, description="What is damaged, if it is.")
+    problem: str | None = Field(default=None, description="What is damaged, if anything.")
     live_refusal: str | None = Field(
         default=None, description="Why it cannot print live, inside Klipper; null: it can."
     )

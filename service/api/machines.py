@@ -50,7 +50,7 @@ _LARGEST_BYTES = 4_000_000
 _BODY = {
     "requestBody": {
         "required": True,
-        "description": "The machine document; `name` must be that of the address.",
+        "description": "The machine document; its `name` must match the address.",
         "content": {"application/json": {"schema": {"$ref": "#/components/schemas/Machine"}}},
     }
 }
@@ -64,14 +64,14 @@ Author = Annotated[
     Query(
         min_length=1,
         max_length=100,
-        description="Who does it, as the caller says; by default the owner of the key.",
+        description="Who makes the change; by default the owner of the key.",
         examples=["anna"],
     ),
 ]
-Message = Annotated[str, Query(max_length=2000, description="Why.")]
+Message = Annotated[str, Query(max_length=2000, description="Reason for the change.")]
 Number = Annotated[int, Path(ge=1, le=999_999, description="Number of a revision.")]
 IfMatch = Annotated[
-    str | None, Header(description="ETag of the machine that the change was made on, or `*`.")
+    str | None, Header(description="ETag of the state that the change is based on, or `*`.")
 ]
 
 router = APIRouter(prefix="/v1/machines", tags=["machines"])
@@ -186,10 +186,10 @@ async def put_machine(
     caller: Admin,
     change: Annotated[Change, Depends()],
 ) -> RevisionView:
-    """Make a document the machine's current state, as a new revision.
+    """Store a document as a new revision of the machine.
 
-    To change a machine say by `If-Match` which state the change was made on. A document that
-    changes nothing makes no revision.
+    To change an existing machine, send the ETag of the state that the change is based on as
+    `If-Match`. An unchanged document makes no revision.
     """
     await run_in_threadpool(_expected, _store(request), name, change.if_match)  # before the body
     content = await receive_document(request, max_bytes=_LARGEST_BYTES)
@@ -282,7 +282,7 @@ def approve_revision(
     author: Author = None,
     message: Message = "",
 ) -> RevisionView:
-    """Say that a revision may be used for jobs. An approval that stands already stays."""
+    """Approve a revision for use in jobs. An existing approval is kept."""
     store = _store(request)
     with as_problems():
         _check_own(name)
@@ -307,7 +307,7 @@ def roll_back(
     message: Message = "",
     if_match: IfMatch = None,
 ) -> RevisionView:
-    """Bring an earlier state back, as a new revision."""
+    """Restore an earlier state as a new revision."""
     store = _store(request)
     with as_problems():
         expected = _check_state(store, name, if_match)

@@ -111,10 +111,10 @@ class Metrics(Collector):
     def collect(self) -> Iterator[Metric]:
         """Yield what is read from the store; without a database only that it is away."""
         watchers = self._watchers()
-        yield GaugeMetricFamily("stillpath_sse_watchers", "Who watch jobs", value=watchers)
+        yield GaugeMetricFamily("stillpath_sse_watchers", "Clients that watch jobs", value=watchers)
         workers = self._workers()
         if workers is not None:
-            yield GaugeMetricFamily("stillpath_workers", "Processes that do jobs", value=workers)
+            yield GaugeMetricFamily("stillpath_workers", "Worker processes", value=workers)
         now = time.time()
         try:
             counts = self._store().counts()
@@ -122,9 +122,11 @@ class Metrics(Collector):
             for_room, most_bytes = self._store().waiting_for_room()
             ended = self._store().ended_between(self._read_until, now - _SETTLED_S)
         except StoreError:
-            yield GaugeMetricFamily("stillpath_database_up", "Whether it answers", value=0)
+            yield GaugeMetricFamily(
+                "stillpath_database_up", "Whether the database responds", value=0
+            )
             return
-        yield GaugeMetricFamily("stillpath_database_up", "Whether it answers", value=1)
+        yield GaugeMetricFamily("stillpath_database_up", "Whether the database responds", value=1)
         self._read_until = now - _SETTLED_S
         for job in ended:
             if job.started_at is not None and job.finished_at is not None:
@@ -134,11 +136,11 @@ class Metrics(Collector):
             jobs.add_metric((state.value,), count)
         yield jobs
         yield GaugeMetricFamily(
-            "stillpath_jobs_waiting_for_room", "Jobs that the disk has no room for", value=for_room
+            "stillpath_jobs_waiting_for_room", "Jobs that wait for disk space", value=for_room
         )
         yield GaugeMetricFamily(
             "stillpath_room_wanted_bytes",
-            "Room on the disk that the largest of these needs at least",
+            "Least disk space that the largest of these needs",
             value=most_bytes,
         )
         free_bytes = self._free_bytes()

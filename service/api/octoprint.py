@@ -35,7 +35,7 @@ router = APIRouter(tags=["printers"])
 
 
 class ApiVersion(BaseModel):
-    """What OctoPrint says of itself."""
+    """OctoPrint's version information."""
 
     model_config = ConfigDict(
         json_schema_extra={"examples": [{"api": "0.1", "server": "1.10.0", "text": _TEXT}]}
@@ -47,7 +47,7 @@ class ApiVersion(BaseModel):
 
 
 class LocalFile(BaseModel):
-    """A file, as OctoPrint tells of it."""
+    """A file in OctoPrint's format."""
 
     name: str
     path: str
@@ -92,7 +92,7 @@ class Stored(BaseModel):
     "/api/version", responses=responses(401, 403, 429), summary="OctoPrint-compatible version"
 )
 async def version(_: Reader) -> ApiVersion:
-    """Answer a slicer's test of the connection."""
+    """Answer a slicer's connection test."""
     return ApiVersion()
 
 
@@ -102,7 +102,7 @@ async def version(_: Reader) -> ApiVersion:
     summary="OctoPrint-compatible version",
 )
 async def version_of(request: Request, name: PrinterName, _: Reader) -> ApiVersion:
-    """Answer a slicer's test of the connection."""
+    """Answer a slicer's connection test."""
     if name not in request.app.state.printers:
         await run_in_threadpool(_check_machine, request, name)
     return ApiVersion()
@@ -118,7 +118,7 @@ _REFUSALS = 401, 403, 408, 413, 422, 429, 507
 
 @router.post("/api/files/local", responses=responses(*_REFUSALS), **_UPLOAD)
 async def upload(request: Request, response: Response, caller: Uploader) -> Stored:
-    """Make a job of the file, for the only printer there is."""
+    """Queue a job for the file; there must be exactly one printer."""
     printers = request.app.state.printers
     if len(printers) != 1:
         raise Problem(
@@ -134,7 +134,7 @@ async def upload(request: Request, response: Response, caller: Uploader) -> Stor
 async def upload_for(
     request: Request, response: Response, name: PrinterName, caller: Uploader
 ) -> Stored:
-    """Make a job of the file; a printer gets the result, and prints it if `print` is true."""
+    """Queue a job for the file. A printer gets the result, and prints it if `print` is true."""
     return await _taken(request, response, name, caller)
 
 

@@ -29,11 +29,11 @@ class PrinterView(BaseModel):
 
     name: str
     kind: Literal["moonraker", "octoprint"]
-    machine: str = Field(description="That files for it are made with.")
+    machine: str = Field(description="Machine that files for it are made with.")
     method: str | None
     tolerance_um: float | None
     budget_um: float | None
-    start: bool = Field(description="Whether `print=true` may be asked for.")
+    start: bool = Field(description="Whether `print=true` is allowed.")
 
 
 @router.get("", responses=responses(401, 403, 429), summary="List the printers")
@@ -76,7 +76,7 @@ def check_printer(request: Request, name: Name, caller: Reader) -> PrinterCheck:
     summary="Accept the current printer configuration",
 )
 def accept_printer(request: Request, name: Name, caller: Admin) -> PrinterCheck:
-    """Remember the configuration as it is now: from here on changes are counted."""
+    """Remember the current configuration; later checks report changes since then."""
     found = _checked(request, name, accept=True)
     record(request, caller, "accept", name, machine=found.machine)
     return found

@@ -94,9 +94,9 @@ def _file(kinds: tuple[str, ...], description: str, *more: int) -> dict[int | st
 )
 @router.head("/result", include_in_schema=False)
 async def read_result(request: Request, job_id: JobId, caller: Reader) -> Response:
-    """Stream the written file: of the kind that was submitted. Obeys `Range`.
+    """Stream the written file, in the format of the submitted one; `Range` is supported.
 
-    Of jobs that compute something else, the answer.
+    For jobs of other kinds, this is their result.
     """
     job = await find_done(request, job_id, caller, of_any_kind=True)
     storage: Storage = request.app.state.storage
@@ -147,7 +147,7 @@ async def read_report_json(request: Request, job_id: JobId, caller: Reader) -> R
 )
 @router.head("/layers", include_in_schema=False)
 async def read_layers(request: Request, job_id: JobId, caller: Reader) -> Response:
-    """Return what layers there are: height, features, errors, and the size of their tiles."""
+    """List the layers with height, features, errors and the size of their tiles."""
     return await _part(request, job_id, caller, "layers.json", "application/json")
 
 
@@ -187,7 +187,6 @@ async def read_layer(
 async def _part(
     request: Request, job_id: str, caller: Caller, name: str, media_type: str
 ) -> Response:
-    """Return a file of a job's report."""
     job = await find_done(request, job_id, caller)
     return await stored(
         request,

@@ -102,7 +102,7 @@ class JobQuery(Options):
         default=None,
         min_length=1,
         max_length=64,
-        description="What several jobs have in common; `GET /v1/jobs?batch=` finds them.",
+        description="Label of a group of jobs; `GET /v1/jobs?batch=` lists them.",
     )
     fresh: bool = Field(
         default=False,
@@ -128,7 +128,7 @@ class JobQuery(Options):
 
 
 class Links(BaseModel):
-    """Where to go from here; what comes of a job is there once it is done."""
+    """Addresses of a job; those of its results are set once it is done."""
 
     self: str
     events: str
@@ -146,8 +146,8 @@ class DeliveryView(BaseModel):
     target: str = Field(description="The printer, or the webhook's address without its path.")
     state: Literal["waiting", "sending", "done", "failed"]
     attempts: int
-    next_at: datetime | None = Field(description="When it is tried again; null: it is not.")
-    error: str | None = Field(description="What went wrong the last time.")
+    next_at: datetime | None = Field(description="Time of the next attempt; null: there is none.")
+    error: str | None = Field(description="Error of the last attempt.")
 
     @classmethod
     def of(cls, delivery: Delivery) -> DeliveryView:
@@ -176,10 +176,10 @@ class JobView(BaseModel):
         description="What is computed; jobs of other kinds than `compensation` have a result only.",
     )
     state: JobState
-    stage: str = Field(description="What is being done, for a person.")
+    stage: str = Field(description="Current stage, for display.")
     room_bytes: int | None = Field(
         default=None,
-        description="Room on the disk that it needs at least, while it waits for that.",
+        description="Least disk space that it needs, while it waits for space.",
     )
     progress: float = Field(ge=0, le=1)
     eta_s: float | None = Field(description="Seconds still needed; null while unknown.")
@@ -192,7 +192,7 @@ class JobView(BaseModel):
     batch: str | None
     priority: int
     machine: str
-    machine_revision: str = Field(description="Names the state of the machine that is used.")
+    machine_revision: str = Field(description="Revision of the machine that is used.")
     options: dict[str, Any]
     source_name: str
     source_bytes: int
@@ -212,7 +212,8 @@ class JobView(BaseModel):
         description="Why the job failed, as a problem document (RFC 9457)."
     )
     deliveries: list[DeliveryView] = Field(
-        default=[], description="What goes out once it is over; empty in lists and events."
+        default=[],
+        description="Notifications and uploads after its end; empty in lists and events.",
     )
     links: Links
 
@@ -245,7 +246,7 @@ class JobPage(BaseModel):
 
 
 class LayerIndex(BaseModel):
-    """What tiles of the print there are."""
+    """Index of the tiles of a print."""
 
     model_config = ConfigDict(extra="allow")
 

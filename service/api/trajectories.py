@@ -53,8 +53,8 @@ async def read_trajectories(
 ) -> Response:
     """Return the motion before and after, planned and simulated, with the contour errors.
 
-    A job of its own computes it, which takes as long as the first one did up to `stop_s`; at most
-    600 s of the print at once.
+    A separate job computes it, which takes as long as the first one did up to `stop_s`. At most
+    600 s of the print can be fetched at once.
     """
     stop_s = start_s + 60.0 if stop_s is None else stop_s
     if not 0 < stop_s - start_s <= _LONGEST_S:

@@ -328,7 +328,6 @@ def _is_open(connection: Connection) -> bool:
 
 
 def _commit_group(engine: Engine) -> None:
-    """Execute all pending writes in one transaction."""
     # Skip writes that their owners are withdrawing.
     pending = [write for write in _WRITE_QUEUE.copy() if write.engine is engine and _dequeue(write)]
     try:

@@ -46,7 +46,7 @@ class Delivery:
     next_at : float
         Seconds since the epoch: when it is tried next, or until when its sender has claimed it.
     error : str or None
-        What went wrong the last time.
+        Error of the last attempt.
     """
 
     id: int

@@ -304,7 +304,6 @@ class Sender:
         )
 
     def _machine(self, job: Job) -> Machine:
-        """Return the machine that the job was done with."""
         with self._storage.local(job.machine_file) as file:
             return PinnedMachine.read(file).machine
 

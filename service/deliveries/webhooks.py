@@ -47,7 +47,8 @@ def body_of(job: Job) -> bytes:
             "error": job.problem,
             "created_at": _moment(job.created_at),
             "finished_at": _moment(job.finished_at),
-            "links": {"self": here, **({} if job.output is None else _results(here))},
+            "links": {"self": here}
+            | ({} if job.output is None else {n: f"{here}/{n}" for n in ("result", "report")}),
         },
     }
     return json.dumps(told, sort_keys=True, separators=(",", ":")).encode()
@@ -99,10 +100,6 @@ def send_webhook(job: Job, target: Target, secret: str, *, delivery: int, now: f
         "Stillpath-Event": f"job.{job.state.value}",
     }
     return post(target, headers=headers, content=body, timeout_s=_TIMEOUT_S)
-
-
-def _results(here: str) -> dict[str, str]:
-    return {"result": f"{here}/result", "report": f"{here}/report"}
 
 
 def _moment(seconds: float | None) -> str | None:

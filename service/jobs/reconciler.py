@@ -183,7 +183,6 @@ class Reconciler:
         self._hand_over()
 
     def _forget(self) -> None:
-        """Forget the submitted jobs and the state of troubles."""
         self._in_flight.clear()
         self._broken_since.clear()
 

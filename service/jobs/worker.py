@@ -262,7 +262,6 @@ def _no_room_in_storage(job: Job, workplace: Workplace) -> Event:
 
 
 def _written_bytes(job: Job, workplace: Workplace) -> int:
-    """Return the size of the attempt's folder."""
     written = 0
     with contextlib.suppress(OSError):  # files may disappear meanwhile
         for path in _place(job, workplace).rglob("*"):

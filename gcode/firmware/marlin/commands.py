@@ -260,7 +260,6 @@ def unheeded(kind: EventKind, why: str, *, origin: bool = True) -> Handler:
 
 
 def _other_tool(state: MachineState, given: Mapping[str, float]) -> bool:
-    """Return whether a command names a tool that is not the one in use."""
     return "T" in given and int(given["T"]) != int(state.i[at.I_TOOL])
 
 

@@ -69,7 +69,6 @@ class RepRapPlanner(QueuePlanner):
         return phases
 
     def _reset(self) -> None:
-        """Empty the ring."""
         self._state = np.zeros(kernels.S_SIZE)
         self._state[kernels.S_SHORT_S] = kernels.SHORT_CLOCKS / self._facts[kernels.C_CLOCK]
         self._count = 0
