@@ -13,7 +13,7 @@ from stillpath.models.firmware.reprapfirmware import Drive
 from stillpath.models.machine import AxisTravel, CommandLimits, Machine
 from stillpath.models.store import load_machine
 from stillpath.pipeline.options import Options
-from stillpath.pipeline.piece_compensator import PieceCompensator, deviation
+from stillpath.pipeline.piece_compensator import PieceCompensator, deviation, strayed
 from tests.compensating import compensated
 from tests.gcode.cutting import HEAD, pieces_of
 
@@ -108,3 +108,15 @@ def test_where_the_shaper_would_serve_better_it_is_said(
 def fast(machine: Machine, speed_mm_s: float) -> Machine:
     """The machine with another highest speed of the command."""
     return machine.model_copy(update={"command": CommandLimits(velocity_mm_s=speed_mm_s)})
+
+
+@pytest.mark.parametrize(
+    ("apart_um", "lasts", "allowed"),
+    [(21.0, 2000, True), (35.0, 20, True), (35.0, 200, False), (50.0, 20, False)],
+)
+def test_motion_may_leave_its_command_only_briefly(
+    apart_um: float, lasts: int, allowed: bool
+) -> None:
+    gap_mm = np.zeros(5000)
+    gap_mm[:lasts] = 1e-3 * apart_um
+    assert (strayed(gap_mm, np.ones(5000, np.bool_), 2e-3) is None) is allowed
