@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import structlog
 from sqlalchemy import Engine
@@ -16,7 +17,6 @@ from stillpath.applications.machines.resolve import PinnedMachine
 from stillpath.compensation.defaults import DEFAULT_METHOD
 from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
-from stillpath.models.store import load_machine
 from stillpath.service.database.engine import DatabaseAway
 from stillpath.service.deliveries import rows
 from stillpath.service.deliveries.checking import Checker, PrinterUnknown
@@ -306,11 +306,11 @@ class Sender:
 
     def _machine(self, job: Job) -> Machine:
         """Return the machine that the job was done with."""
-        try:
-            with self._storage.local(job.machine_file) as file:
-                return PinnedMachine.read(file, job.machine).machine
-        except FileNotFoundError:  # a job of an earlier version
-            return load_machine(job.machine)
+        with contextlib.ExitStack() as copy:
+            file = Path("none")
+            with contextlib.suppress(FileNotFoundError):
+                file = copy.enter_context(self._storage.local(job.machine_file))
+            return PinnedMachine.read(file, job.machine, job.machine_revision).machine
 
 
 @contextlib.contextmanager

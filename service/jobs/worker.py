@@ -298,12 +298,13 @@ def _work(job: Job, workplace: Workplace, runner: Runner, watch: Watch, folder: 
         try:
             machine = fetch(job.machine_file)
         except FileNotFoundError:
-            machine = folder / "machine.json"  # it needs none, or is a job of an earlier version
+            machine = folder / "machine.json"  # does it need one? `Task.pinned` knows
         cache = workplace.settings.data_dir / "cache"
         cache.mkdir(parents=True, exist_ok=True)
         summary = runner(
             Task(
                 machine=job.machine,
+                machine_revision=job.machine_revision,
                 machine_file=machine,
                 options=job.options,
                 sources=sources,

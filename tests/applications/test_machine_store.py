@@ -416,12 +416,24 @@ def test_a_pinned_machine_comes_back_as_it_was(tmp_path: Path):
     pinned = PinnedMachine(machine=make_machine(), number=3, warnings=("old",))
     file = tmp_path / "machine.json"
     pinned.write(file)
-    assert PinnedMachine.read(file, "mine") == pinned
+    assert PinnedMachine.read(file, "mine", pinned.machine.revision) == pinned
     # A job of a version that pinned nothing.
-    assert PinnedMachine.read(tmp_path / "none", "ender3").machine == load_machine("ender3")
+    built_in, none = load_machine("ender3"), tmp_path / "none"
+    assert PinnedMachine.read(none, "ender3", built_in.revision).machine == built_in
+
+
+def test_no_other_machine_of_the_name_stands_in_for_a_pinned_one(tmp_path: Path):
+    file, none, revision = tmp_path / "machine.json", tmp_path / "none", make_machine().revision
+    refused = rf"no longer has machine '\w+' as it was .*revision {revision}.* submit it again"
+    for name in ("mine", "ender3"):
+        with pytest.raises(ModelError, match=refused):
+            PinnedMachine.read(none, name, revision)
     file.write_text("{")
-    with pytest.raises(ModelError, match=r"machine\.json: damaged"):
-        PinnedMachine.read(file, "mine")
+    with pytest.raises(ModelError, match=refused):
+        PinnedMachine.read(file, "mine", revision)
+    PinnedMachine(machine=with_accel(make_machine(), 3e3)).write(file)
+    with pytest.raises(ModelError, match=refused):
+        PinnedMachine.read(file, "mine", revision)
 
 
 @pytest.mark.skipif(sys.platform in ("win32", "darwin"), reason="the XDG convention")
