@@ -48,8 +48,9 @@ from stillpath.service.storage.factory import open_storage
 
 __all__ = ["Workplace", "execute", "run_compensation", "run_job"]
 
-_PATIENCE_S = 60.0
-"""Time for which storage and database may be unavailable before an attempt is given up."""
+_PATIENCE_S = 180.0
+"""Time for which storage and database may be unavailable before an attempt is given up. A request
+to S3 alone may take a minute."""
 _LONGEST_PAUSE_S = 4.0
 _KEPT_BYTES = 256 << 20
 _MOST_KEPT_BYTES = 512 << 20
