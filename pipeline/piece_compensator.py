@@ -431,8 +431,8 @@ def strayed(
     if printed <= tolerance_mm + _EXTRUDING_EXCESS_MM and worst <= tolerance_mm + _TRAVEL_EXCESS_MM:
         return None
     return (
-        f"the motion is {1e3 * printed:.1f} um from its command while extruding and "
-        f"{1e3 * worst:.1f} um at worst (tolerance {1e3 * tolerance_mm:g} um)"
+        f"the motion is {1e3 * printed:.1f} µm from its command while extruding and "
+        f"{1e3 * worst:.1f} µm at worst (tolerance {1e3 * tolerance_mm:g} µm)"
     )
 
 
