@@ -85,8 +85,8 @@ def _axis_text(machine: Machine, axis: Literal["x", "y"]) -> str:
         )
     low, high = found.predicted_um
     return (
-        f"{found.verdict} on {found.tested_on}: predicted {um_text(low)} to {um_text(high)} um, "
-        f"measured {um_text(found.measured_um)} um"
+        f"{found.verdict} on {found.tested_on}: predicted {um_text(low)} to {um_text(high)} µm, "
+        f"measured {um_text(found.measured_um)} µm"
     )
 
 

@@ -105,7 +105,7 @@ class BandContent:
                 beyond = float(self.beyond_um(high_hz)[i])
                 if beyond > NOTABLE_UM:
                     found.append(
-                        f"Axis {axis}: {beyond:.1f} um rms of the planned motion lie above "
+                        f"Axis {axis}: {beyond:.1f} µm rms of the planned motion lie above "
                         f"{high_hz:g} Hz, where its model was not measured (band_hz): the figures "
                         "are a guess there. Measure up to higher frequencies, or print with less "
                         "acceleration."
@@ -114,7 +114,7 @@ class BandContent:
                 beyond = float(self.beyond_um(trust_hz)[i])
                 if beyond > NOTABLE_UM:
                     found.append(
-                        f"Axis {axis}: {beyond:.1f} um rms of the planned motion lie above "
+                        f"Axis {axis}: {beyond:.1f} µm rms of the planned motion lie above "
                         f"{trust_hz:.3g} Hz, where its model cannot be trusted "
                         "(trust_below_hz): the phase was not measured. A raw accelerometer log "
                         "would show it."

@@ -206,9 +206,10 @@ def prediction_note(machine: Machine, choice: Choice) -> str:
         measured.append(f"{len(plants.weighted_members())} ({axis.upper()}: {what}{day})")
     return (
         f"Figures are predicted with the central plants of {' and '.join(measured)} that "
-        "explain the measurement. On a test motion, delays between the axes aside, no plant "
-        f"has more than {choice.worst_to_none:.2f} of its contour error without compensation, and "
-        f"on average {choice.mean:.2f} of the shaper's ({choice.worst:.2f} for the worst plant)."
+        "explain the measurement. On a test motion (delays between the axes left out), the contour "
+        f"error of every plant is at most {choice.worst_to_none:.2f} of that without compensation; "
+        f"it is {choice.mean:.2f} of the shaper's on average ({choice.worst:.2f} for the worst "
+        "plant)."
     )
 
 

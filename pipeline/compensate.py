@@ -155,6 +155,6 @@ def _fitting(options: Options, name: str) -> Options:
     if less is None:
         raise GcodeError(
             f"{name} exceeds max_mb {options.max_mb:g} even if only its outer walls are "
-            f"compensated, with a tolerance of {options.tolerance_um:g} um: allow more"
+            f"compensated, with a tolerance of {options.tolerance_um:g} µm: allow more"
         )
     return less

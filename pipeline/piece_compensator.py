@@ -438,8 +438,8 @@ def strayed(
         if printed <= most_mm or squared.max() <= (_BRIEF_RMS * most_mm) ** 2:
             return None
     return (
-        f"the motion is {1e3 * printed:.1f} um from its command while extruding and "
-        f"{1e3 * worst:.1f} um at worst (tolerance {1e3 * tolerance_mm:g} um)"
+        f"the motion is {1e3 * printed:.1f} µm from its command while extruding and "
+        f"{1e3 * worst:.1f} µm at worst (tolerance {1e3 * tolerance_mm:g} µm)"
     )
 
 

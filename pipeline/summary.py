@@ -138,7 +138,7 @@ class Summary:
         compared = self.budget is None and not self.options.method.startswith("shaper:")
         if compared and ours >= max(shaper, NEGLIGIBLE_UM):
             yield (
-                f"{SHAPER_IS_BETTER}: {self.shaper.label} alone would leave {um_text(shaper)} um "
-                f"rms of contour error, this file {um_text(ours)} um. "
+                f"{SHAPER_IS_BETTER}: {self.shaper.label} alone would leave {um_text(shaper)} µm "
+                f"rms of contour error, this file {um_text(ours)} µm. "
                 "Print it as sliced with that shaper, or let method advise write the commands"
             )

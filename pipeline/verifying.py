@@ -136,6 +136,6 @@ class Verifier:
         sliced_um, ours_um = (1e3 * tally.rms for tally in meter.contour_extruding)
         if ours_um > max(_CLEARLY * sliced_um, NEGLIGIBLE_UM):
             raise Unfit(
-                f"rounded to motor steps, its contour error would be {ours_um:.1f} um rms, against "
-                f"{sliced_um:.1f} um as sliced"
+                f"rounded to motor steps, its contour error would be {ours_um:.1f} µm rms, against "
+                f"{sliced_um:.1f} µm as sliced"
             )

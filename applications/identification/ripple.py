@@ -119,7 +119,7 @@ def _summary(axis: RippleAxis, machine: Machine, learning: RippleLearning) -> st
             sd = "" if h.sd_um is None else f" +- {h.sd_um:.2f}"
             lines.append(
                 f"  {source.name} {source.pitch_mm:g} mm, {source.enters}, harmonic {h.number}: "
-                f"{h.amplitude_um:.2f}{sd} um at {h.phase_deg:.1f} deg"
+                f"{h.amplitude_um:.2f}{sd} µm at {h.phase_deg:.1f} deg"
             )
     lines += [
         f"  {seen.source} {seen.number}: noise gain {seen.noise_gain:.2f}, "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from datetime import UTC, datetime
 from pathlib import Path
@@ -16,7 +17,6 @@ from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
 from stillpath.models.store import (
     builtin_machines,
-    explain,
     load_machine,
     names_a_file,
     no_such_machine,
@@ -48,12 +48,24 @@ class PinnedMachine(Document):
             os.fsync(opened.fileno())
 
     @classmethod
-    def read(cls, file: Path) -> PinnedMachine:
-        """Read a file of `write`."""
-        try:
-            return cls.model_validate_json(file.read_bytes())
-        except ValidationError as error:
-            raise ModelError(f"{file}: damaged: {explain(error)}; hand the job in again") from None
+    def read(cls, file: Path, name: str, revision: str) -> PinnedMachine:
+        """Return the machine `name` that a job was submitted with, from a file of `write`.
+
+        Raises
+        ------
+        ModelError
+            If the file does not hold the machine of this `revision` (`Machine.revision`).
+        """
+        found = None
+        with contextlib.suppress(FileNotFoundError, ValidationError):
+            found = cls.model_validate_json(file.read_bytes())
+        if found is None or found.machine.revision != revision:
+            raise ModelError(
+                f"the storage no longer has machine {name!r} as it was when the job was submitted "
+                f"(revision {revision}): machine.json is gone, damaged or another one; check "
+                "the storage's disk, delete the job, and submit it again"
+            )
+        return found
 
 
 class Resolver:

@@ -295,14 +295,14 @@ class _Axis:
         low, high = compensated.predicted_um
         said = (
             f"measured {um_text(compensated.measured_um)} ± "
-            f"{um_text(compensated.scatter_um, 1)} um after "
+            f"{um_text(compensated.scatter_um, 1)} µm after "
             f"{compensated.stops} compensated stops, predicted {um_text(low)} to "
             f"{um_text(high)}; "
-            f"{um_text(planned.measured_um)} um as planned"
+            f"{um_text(planned.measured_um)} µm as planned"
         )
         if off.rms < _ABOVE_FLOOR * noise_um:
             return "says nothing", (
-                f"{said}: the noise of the log is {um_text(noise_um)} um, too much for this "
+                f"{said}: the noise of the log is {um_text(noise_um)} µm, too much for this "
                 "ringing; take a better sensor, or fix it better"
             )
         least, most = on.reaches(-_SIGMAS), on.reaches(_SIGMAS)

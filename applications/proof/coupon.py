@@ -106,7 +106,7 @@ def _legend(
         "X rings on the outer side walls, Y on the front walls; compare from the corner on.",
         "Predicted distance of the nozzle from the walls:",
         *(
-            f"  {half}: {found.rms_um:.1f} um rms, {found.largest_um:.0f} um at most"
+            f"  {half}: {found.rms_um:.1f} µm rms, {found.largest_um:.0f} µm at most"
             for half, found in ((half, ringing[half]) for half in (AS_PLANNED, COMPENSATED))
         ),
         f"Print time {result.time_s / 60:.1f} min without heating and homing.",

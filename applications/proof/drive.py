@@ -118,7 +118,7 @@ def drive(machine: Machine, modes: Sequence[RingingMode], flow_mm_s: float, run_
                 best = score, Drive(float(speed), float(accel), least)
     if best is None:
         raise ModelError(
-            f"no speed from {_LOWEST_MM_S:g} mm/s on rings less than {2 * _LARGEST_UM:g} um on "
+            f"no speed from {_LOWEST_MM_S:g} mm/s on rings less than {2 * _LARGEST_UM:g} µm on "
             "this machine: is the model right?"
         )
     return best[1]

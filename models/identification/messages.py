@@ -75,7 +75,7 @@ def body_notes(friction_mm: float, frame: Frame | None) -> list[str]:
     notes = []
     if friction_mm:
         notes.append(
-            f"dry friction holds the axis {1e3 * friction_mm:.1f} um behind its command: "
+            f"dry friction holds the axis {1e3 * friction_mm:.1f} µm behind its command: "
             "commands compensate for it"
         )
     if frame is not None:

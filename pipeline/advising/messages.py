@@ -81,8 +81,8 @@ def beyond_bounds(
     has_budget : bool
     """
     return [
-        f"{feature.name}: {feature.after_um:.1f} um are predicted, more than the "
-        f"{feature.bound_um:.1f} um it may have"
+        f"{feature.name}: {feature.after_um:.1f} µm are predicted, more than the "
+        f"{feature.bound_um:.1f} µm it may have"
         + (
             f": no acceleration from {lowest_mm_s2:.0f} mm/s^2 on would do. Corners shake the "
             "machine too (square corner velocity, jerk, junction deviation)."
@@ -99,7 +99,7 @@ def beyond_bounds(
 def kept_beyond(features: Sequence[AdvisedFeature]) -> list[str]:
     """Return warnings about invisible features beyond the budget, which are not slowed down."""
     names = [
-        f"{f.name} ({f.after_um:.1f} um)" for f in features if not f.within_bound and not f.exact
+        f"{f.name} ({f.after_um:.1f} µm)" for f in features if not f.within_bound and not f.exact
     ]
     if not names:
         return []

@@ -268,8 +268,8 @@ class SpeedBudget:
                 " for the budget"
             )
             warnings.append(
-                f"The contour error of {_name(one, names)} is {error.rms_um:.2f} um (rms, worst "
-                f"plant of the set), above the budget of {self.budget_um:g} um; {remedy}."
+                f"The contour error of {_name(one, names)} is {error.rms_um:.2f} µm (rms, worst "
+                f"plant of the set), above the budget of {self.budget_um:g} µm; {remedy}."
             )
         if self._gentler_s > 0.0:
             warnings.append(

@@ -37,6 +37,7 @@ from stillpath.service.api import (
     trajectories,
 )
 from stillpath.service.api.computing import StillRunning, still_running
+from stillpath.service.api.file_responses import Verified
 from stillpath.service.api.guard import Guard, hosts_of
 from stillpath.service.api.hub import Hub
 from stillpath.service.api.intake import Intake
@@ -194,6 +195,7 @@ async def _open(app: FastAPI, settings: Settings, runner: Runner, stack: AsyncEx
     )
     state.identifications = Archive(open_documents(settings, engine, "identifications"))
     state.layers = results.Layers(storage)
+    state.verified = Verified(storage)
     state.checker = Checker(open_documents(settings, engine, "printers"))
     state.intake = Intake(
         settings,

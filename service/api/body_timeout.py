@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from starlette.exceptions import HTTPException
@@ -19,6 +20,7 @@ QUIET_S = 30.0
 LEAST_BYTES = 1024
 """Least number of bytes in that time: single bytes must not suffice to hold a slot."""
 _YIELDS_AFTER_S = 5.0
+_DISCARDS_S = 60.0
 
 
 class BodyTimeout:
@@ -66,6 +68,21 @@ class BodyTimeout:
         if self._bytes >= LEAST_BYTES:
             self._waited_s, self._bytes = 0.0, 0
         return message
+
+    async def discard(self) -> None:
+        """Read what is left for a minute at most: who still sends may not hear an answer.
+
+        Closing a connection with unread bytes resets it, and the answer is lost with it.
+        """
+        with suppress(TimeoutError, HTTPException):
+            async with asyncio.timeout(_DISCARDS_S):
+                while not self._whole:
+                    await self.receive()
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether all has come, or its sender is gone."""
+        return self._whole
 
     @property
     def quiet_s(self) -> float:

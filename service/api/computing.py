@@ -30,6 +30,7 @@ from stillpath.service.api.schemas import JobView
 from stillpath.service.jobs.problems import problem
 from stillpath.service.jobs.state import Cancelled, Job, JobKind, JobState
 from stillpath.service.security.callers import Caller
+from stillpath.service.storage.base import Storage
 from stillpath.version import __version__
 
 __all__ = [
@@ -179,7 +180,7 @@ def prefers_page(accept: str) -> bool:
 
 async def read_result(request: Request, job: Job) -> Any:
     """Return the answer of a job, which is JSON."""
-    storage = request.app.state.storage
+    state = request.app.state
     size = job.result_bytes or 0
     if size > _LARGEST_ANSWER_BYTES:
         raise Problem(
@@ -187,12 +188,27 @@ async def read_result(request: Request, job: Job) -> Any:
             "Result too large",
             f"It has {size} bytes; fetch /v1/jobs/{job.id}/result.",
         )
-    try:
-        return await run_in_threadpool(
-            lambda: json.loads(b"".join(storage.read(job.result, 0, size)))
+    content = await run_in_threadpool(_content, state.storage, job)
+    if content is None:
+        # The same question would lead to this job again.
+        await run_in_threadpool(state.store.forget, job.id)
+        raise Problem(
+            503,
+            "Answer lost",
+            f"The answer of job {job.id} is gone from the storage or damaged, and was deleted: ask "
+            "again, and it is computed anew. Check the storage's disk.",
+            headers={"Retry-After": "1"},
         )
+    return json.loads(content)
+
+
+def _content(storage: Storage, job: Job) -> bytes | None:
+    """Return an answer as the worker stored it; None if it is gone or damaged."""
+    try:
+        content = b"".join(storage.read(job.result, 0, job.result_bytes or 0))
     except FileNotFoundError:
-        raise no_such_job(job.id) from None
+        return None
+    return content if hashlib.sha256(content).hexdigest() == job.result_sha256 else None
 
 
 def _submit(request: Request, asked: ComputeRequest, job: Job) -> Job:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
+import threading
+from collections import OrderedDict
 from collections.abc import AsyncIterator, Iterator
 from urllib.parse import quote
 
@@ -11,10 +14,21 @@ from starlette.concurrency import iterate_in_threadpool, run_in_threadpool
 from starlette.responses import Response, StreamingResponse
 
 from stillpath.service.api.problems import Problem
+from stillpath.service.jobs.state import Job
 from stillpath.service.storage.base import Stat, Storage
 
-__all__ = ["HEADERS", "MEDIA", "RANGES", "damaged", "matches", "stored"]
+__all__ = [
+    "HEADERS",
+    "MEDIA",
+    "RANGES",
+    "Verified",
+    "damaged",
+    "matches",
+    "stored",
+    "stored_result",
+]
 
+_VERIFIED_KEPT = 4096
 _RANGE = re.compile(r"bytes=(\d{1,18})?-(\d{1,18})?")
 
 MEDIA = {".csv": "text/csv", ".npz": "application/octet-stream", ".json": "application/json"}
@@ -33,6 +47,56 @@ RANGES: dict[int | str, dict[str, str]] = {
 """OpenAPI entries for the other answers a stored file can give."""
 
 
+class Verified:
+    """Compares results with the SHA-256 in their rows, again only where size or time have changed.
+
+    Before anything is sent: that covers parts of files, and clients that look at no digest.
+
+    Parameters
+    ----------
+    storage : Storage
+    """
+
+    def __init__(self, storage: Storage) -> None:
+        self._storage = storage
+        self._kept: OrderedDict[Stat, str] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def check(self, job: Job) -> None:
+        """Raise `Problem` 404 if a job's result is gone or damaged."""
+        found = _found(self._storage, job.result)
+        if found.size_bytes != job.result_bytes:
+            raise damaged(job.result, f"{found.size_bytes} bytes instead of {job.result_bytes}")
+        with self._lock:
+            digest = self._kept.get(found)
+        if digest is None:
+            hashing = hashlib.sha256()
+            for chunk in self._storage.read(job.result, 0, found.size_bytes):
+                hashing.update(chunk)
+            digest = hashing.hexdigest()
+        if digest != job.result_sha256:
+            raise damaged(job.result, f"the SHA-256 {digest} instead of {job.result_sha256}")
+        with self._lock:
+            self._kept[found] = digest
+            self._kept.move_to_end(found)
+            while len(self._kept) > _VERIFIED_KEPT:
+                self._kept.popitem(last=False)
+
+
+async def stored_result(request: Request, job: Job, media_type: str) -> Response:
+    """Return the answer with a job's result, if it is what the worker stored; see `stored`."""
+    state = request.app.state
+    await run_in_threadpool(state.verified.check, job)
+    return await stored(
+        request,
+        state.storage,
+        job.result,
+        media_type=media_type,
+        etag=job.result_sha256,
+        filename=job.result_name,
+    )
+
+
 async def stored(
     request: Request,
     storage: Storage,
@@ -42,7 +106,6 @@ async def stored(
     etag: str | None = None,
     filename: str | None = None,
     span: tuple[int, int] | None = None,
-    size_bytes: int | None = None,
 ) -> Response:
     """Return the answer with a stored file.
 
@@ -60,15 +123,13 @@ async def stored(
         Under which a browser saves it.
     span : (int, int), optional
         First byte, and the one after the last, of what counts as the file.
-    size_bytes : int, optional
-        Size that the file was stored with.
 
     Raises
     ------
     Problem
         404 if the file is gone or damaged, 416 if it has no such range.
     """
-    found = await run_in_threadpool(_found, storage, key, size_bytes)
+    found = await run_in_threadpool(_found, storage, key)
     first, past = span or (0, found.size_bytes)
     if not 0 <= first <= past <= found.size_bytes:
         raise damaged(key, f"{found.size_bytes} bytes, and its index goes up to {past}")
@@ -95,20 +156,20 @@ async def stored(
 
 def damaged(key: str, what: str) -> Problem:
     """Return the problem of a file in the storage that is not what was stored; `what` it has."""
-    detail = f"{key} in the storage has {what}. Check the storage's disk, and submit the job again."
+    detail = (
+        f"{key} in the storage has {what}. Check the storage's disk, delete the job, and submit it "
+        "again."
+    )
     return Problem(404, "The file is damaged", detail)
 
 
-def _found(storage: Storage, key: str, size_bytes: int | None) -> Stat:
+def _found(storage: Storage, key: str) -> Stat:
     try:
-        found = storage.stat(key)
+        return storage.stat(key)
     except FileNotFoundError:
         name = key.rsplit("/", 1)[-1]
-        detail = f"{name} is no longer in the storage. Submit the job again."
+        detail = f"{name} is no longer in the storage. Delete the job, and submit it again."
         raise Problem(404, "The file is gone", detail) from None
-    if size_bytes not in (None, found.size_bytes):
-        raise damaged(key, f"{found.size_bytes} bytes instead of {size_bytes}")
-    return found
 
 
 def matches(header: str | None, tag: str) -> bool:

@@ -13,6 +13,7 @@ from urllib.parse import urlsplit
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from stillpath.service.api.body_timeout import BODY_TIMEOUT, BodyTimeout
 from stillpath.service.api.limits import limited_receive, unreadable
 from stillpath.service.api.problems import Problem, problem_response
 from stillpath.service.settings import Settings, is_loopback
@@ -75,17 +76,25 @@ class Guard:
             await self._app(scope, receive, send)
             return
 
+        received = limited_receive(scope, receive)
+        body: BodyTimeout = scope[BODY_TIMEOUT]
+
         async def sent(message: Message) -> None:
             if message["type"] == "http.response.start":
                 _complete(MutableHeaders(scope=message))
+            elif not message.get("more_body") and _has_body(scope) and not body.is_whole:
+                # Who stops sending at an error reads it now, others when they have sent all.
+                await send({**message, "more_body": True})
+                await body.discard()
+                message = {"type": "http.response.body"}
             await send(message)
 
         refused = unreadable(scope) or self._refusal(scope)
         if refused is None:
-            await self._app(scope, limited_receive(scope, receive), sent)
+            await self._app(scope, received, sent)
         else:
             answer = problem_response(refused.document, refused.headers)
-            await answer(scope, receive, sent)
+            await answer(scope, received, sent)
 
     def _refusal(self, scope: Scope) -> Problem | None:
         headers = Headers(scope=scope)
@@ -115,6 +124,11 @@ class Guard:
                 "STILLPATH_KEYS=true behind a proxy."
             )
         return None
+
+
+def _has_body(scope: Scope) -> bool:
+    headers = Headers(scope=scope)
+    return headers.get("content-length", "0") != "0" or "transfer-encoding" in headers
 
 
 def _foreign(method: str, host: str, headers: Headers) -> str | None:

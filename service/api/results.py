@@ -14,7 +14,14 @@ from starlette.responses import Response
 
 from stillpath.gcode.containers.sniff import Kind, kind_of
 from stillpath.service.api.access import Reader
-from stillpath.service.api.file_responses import HEADERS, MEDIA, RANGES, damaged, stored
+from stillpath.service.api.file_responses import (
+    HEADERS,
+    MEDIA,
+    RANGES,
+    damaged,
+    stored,
+    stored_result,
+)
 from stillpath.service.api.job_lookup import JobId, find_done
 from stillpath.service.api.problems import Problem, responses
 from stillpath.service.api.schemas import LayerIndex
@@ -104,15 +111,7 @@ async def read_result(request: Request, job_id: JobId, caller: Reader) -> Respon
         media_type = (await run_in_threadpool(_kind, storage, job.result)).value
     else:
         media_type = MEDIA[PurePath(job.result_name).suffix]
-    return await stored(
-        request,
-        storage,
-        job.result,
-        media_type=media_type,
-        etag=job.result_sha256,
-        filename=job.result_name,
-        size_bytes=job.result_bytes,
-    )
+    return await stored_result(request, job, media_type)
 
 
 @router.get(

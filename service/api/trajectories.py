@@ -10,7 +10,7 @@ from starlette.responses import Response
 
 from stillpath.service.api.access import Reader
 from stillpath.service.api.computing import WAITING, ComputeRequest, run_and_wait
-from stillpath.service.api.file_responses import MEDIA, stored
+from stillpath.service.api.file_responses import MEDIA, stored_result
 from stillpath.service.api.job_lookup import JobId, find_done
 from stillpath.service.api.problems import Problem, responses
 from stillpath.service.jobs.state import JobKind
@@ -81,11 +81,4 @@ async def read_trajectories(
         source_sha256=job.source_sha256,
     )
     made = await run_and_wait(request, caller, asked)
-    return await stored(
-        request,
-        request.app.state.storage,
-        made.result,
-        media_type=MEDIA[f".{format}"],
-        etag=made.result_sha256,
-        filename=made.result_name,
-    )
+    return await stored_result(request, made, MEDIA[f".{format}"])

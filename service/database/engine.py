@@ -10,7 +10,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast
@@ -29,6 +29,7 @@ from sqlalchemy.pool import NullPool
 
 from stillpath.service.database.migrations import LATEST
 from stillpath.service.permissions import private_file, private_folder
+from stillpath.service.storage.base import StorageError
 
 if TYPE_CHECKING:
     from sqlalchemy import Table
@@ -120,14 +121,17 @@ def open_database(settings: Settings, *, pooled: bool = True) -> Engine:
     Raises
     ------
     StoreError
-        If it cannot be reached, or was written by a newer version.
+        If it cannot be reached, was written by a newer version, or is missing beside files of jobs.
     """
     url = database_url(settings)
     if url.get_backend_name() == "sqlite" and url.database:
+        if not _has_content(Path(url.database)):
+            # Before SQLite deletes the log beside a database without content.
+            _check_is_first_start(settings, url)
         _make_private(Path(url.database))
     engine = make_engine(url, pooled=pooled)
     try:
-        migrate(engine)
+        migrate(engine, before_making=lambda: _check_is_first_start(settings, url))
     except DBAPIError as error:
         engine.dispose()
         raise StoreError(
@@ -154,8 +158,14 @@ def make_engine(url: URL, *, pooled: bool = True) -> Engine:
     return create_engine(url, **pool, pool_pre_ping=True, connect_args=given)
 
 
-def migrate(engine: Engine) -> None:
+def migrate(engine: Engine, *, before_making: Callable[[], None] = lambda: None) -> None:
     """Bring the schema to that of this version, in one transaction, beside others who do so.
+
+    Parameters
+    ----------
+    engine : Engine
+    before_making : callable
+        Called where there are no tables; may raise to leave it at that.
 
     Raises
     ------
@@ -168,6 +178,7 @@ def migrate(engine: Engine) -> None:
     with writing(engine) as connection:
         _lock_schema(connection)
         if not inspect(connection).get_table_names():
+            before_making()
             _make_schema(connection)
             return
     # Imported late: it is slow, and most starts have nothing to migrate.
@@ -191,6 +202,27 @@ def migrate(engine: Engine) -> None:
             )
         config.attributes["connection"] = connection
         command.upgrade(config, "head")
+
+
+def _has_content(file: Path) -> bool:
+    return file.name.startswith(":") or (file.exists() and file.stat().st_size > 0)
+
+
+def _check_is_first_start(settings: Settings, url: URL) -> None:
+    """Refuse to make a database anew where there are files of jobs: the sweep would delete them."""
+    from stillpath.service.storage.factory import open_storage
+
+    if settings.storage_url is None and not settings.data_dir.exists():
+        return
+    with suppress(StorageError):  # a bucket may be made later than the service
+        found = next(iter(open_storage(settings).list("jobs/")), None)
+        if found is not None:
+            raise StoreError(
+                f"the database {url.database} is missing or empty, but the storage has files of "
+                f"jobs ({found.key}), which would be deleted; put the database back, check "
+                "STILLPATH_DATABASE_URL and STILLPATH_DATA_DIR, or restore a backup; to begin "
+                "without these jobs, move the folder jobs out of the storage"
+            )
 
 
 def _make_private(file: Path) -> None:

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import structlog
 from sqlalchemy import Engine
@@ -304,8 +305,12 @@ class Sender:
         )
 
     def _machine(self, job: Job) -> Machine:
-        with self._storage.local(job.machine_file) as file:
-            return PinnedMachine.read(file).machine
+        """Return the machine that the job was done with."""
+        with contextlib.ExitStack() as copy:
+            file = Path("none")
+            with contextlib.suppress(FileNotFoundError):
+                file = copy.enter_context(self._storage.local(job.machine_file))
+            return PinnedMachine.read(file, job.machine, job.machine_revision).machine
 
 
 @contextlib.contextmanager

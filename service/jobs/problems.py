@@ -141,5 +141,6 @@ def storage_away(error: Exception) -> dict[str, Any]:
     return problem(
         503,
         "Storage unavailable",
-        f"The storage does not answer: {error}. Submit the job again once it does.",
+        f"The job's files could not be fetched or stored: {error}. Submit the job again once the "
+        "storage answers.",
     )

@@ -22,8 +22,10 @@ class Task:
 
     Attributes
     ----------
+    machine, machine_revision : str
+        Name and revision of the machine that the job was accepted with.
     machine_file : Path
-        Machine that the job was accepted with (`applications.machines.resolve.PinnedMachine`).
+        The machine itself (`applications.machines.resolve.PinnedMachine`).
     sources : tuple of Path
         Read-only.
     target, report : Path
@@ -35,6 +37,7 @@ class Task:
     """
 
     machine: str
+    machine_revision: str
     machine_file: Path
     options: dict[str, Any]
     sources: tuple[Path, ...]
@@ -56,10 +59,11 @@ class Task:
         Raises
         ------
         ModelError
+            If its file is gone or damaged.
         """
         from stillpath.applications.machines.resolve import PinnedMachine
 
-        return PinnedMachine.read(self.machine_file)
+        return PinnedMachine.read(self.machine_file, self.machine, self.machine_revision)
 
 
 Runner = Callable[[Task, Callable[[Progress], None]], dict[str, Any]]

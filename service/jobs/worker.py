@@ -48,8 +48,9 @@ from stillpath.service.storage.factory import open_storage
 
 __all__ = ["Workplace", "execute", "run_compensation", "run_job"]
 
-_PATIENCE_S = 60.0
-"""Time for which storage and database may be unavailable before an attempt is given up."""
+_PATIENCE_S = 180.0
+"""Time for which storage and database may be unavailable before an attempt is given up. A request
+to S3 alone may take a minute."""
 _LONGEST_PAUSE_S = 4.0
 _KEPT_BYTES = 256 << 20
 _MOST_KEPT_BYTES = 512 << 20
@@ -296,12 +297,13 @@ def _work(job: Job, workplace: Workplace, runner: Runner, watch: Watch, folder: 
         try:
             machine = fetch(job.machine_file)
         except FileNotFoundError:
-            machine = folder / "machine.json"  # it needs none
+            machine = folder / "machine.json"  # does it need one? `Task.pinned` knows
         cache = workplace.settings.data_dir / "cache"
         cache.mkdir(parents=True, exist_ok=True)
         summary = runner(
             Task(
                 machine=job.machine,
+                machine_revision=job.machine_revision,
                 machine_file=machine,
                 options=job.options,
                 sources=sources,

@@ -163,7 +163,7 @@ class S3Storage:
             raise self._trouble(error) from error
 
     def _trouble(self, error: Exception) -> StorageError:
-        said = " ".join(str(error).split())[:400]
+        said = " ".join(str(error).split()).partition(" Debug source")[0][:400]
         return StorageError(
             errno.EIO, f"the storage does not answer as it should: {said}", self._url
         )

@@ -416,10 +416,21 @@ def test_a_pinned_machine_comes_back_as_it_was(tmp_path: Path):
     pinned = PinnedMachine(machine=make_machine(), number=3, warnings=("old",))
     file = tmp_path / "machine.json"
     pinned.write(file)
-    assert PinnedMachine.read(file) == pinned
+    assert PinnedMachine.read(file, "mine", pinned.machine.revision) == pinned
+
+
+def test_no_other_machine_of_the_name_stands_in_for_a_pinned_one(tmp_path: Path):
+    file, none, revision = tmp_path / "machine.json", tmp_path / "none", make_machine().revision
+    refused = rf"no longer has machine '\w+' as it was .*revision {revision}.* submit it again"
+    for name in ("mine", "ender3"):
+        with pytest.raises(ModelError, match=refused):
+            PinnedMachine.read(none, name, revision)
     file.write_text("{")
-    with pytest.raises(ModelError, match=r"machine\.json: damaged"):
-        PinnedMachine.read(file)
+    with pytest.raises(ModelError, match=refused):
+        PinnedMachine.read(file, "mine", revision)
+    PinnedMachine(machine=with_accel(make_machine(), 3e3)).write(file)
+    with pytest.raises(ModelError, match=refused):
+        PinnedMachine.read(file, "mine", revision)
 
 
 @pytest.mark.skipif(sys.platform in ("win32", "darwin"), reason="the XDG convention")

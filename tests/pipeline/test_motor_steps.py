@@ -143,7 +143,7 @@ def samples(executed_um: float, sliced_um: float | None) -> MotionSamples:
 
 def test_what_would_print_worse_stays_as_it_came() -> None:
     verifier = Verifier(load_machine("ender3"), 2.0)
-    with pytest.raises(Unfit, match=r"6.0 um rms, against 3.0 um as sliced"):
+    with pytest.raises(Unfit, match=r"6.0 µm rms, against 3.0 µm as sliced"):
         verifier.check_gain(samples(6.0, 3.0), EMPTY)
     verifier.check_gain(samples(3.0, 6.0), EMPTY)
     # A little more is no reason, nor is what nobody sees, nor where nothing is rounded.

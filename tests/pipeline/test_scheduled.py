@@ -174,7 +174,7 @@ def test_content_of_a_sine() -> None:
     assert content.beyond_um(60.0)[0] < 1e-3
     assert content.beyond_um(90.0)[1] < 0.1
     (warning,) = content.warnings()
-    assert "Axis y: 14.1 um rms of the planned motion lie above 60 Hz" in warning
+    assert "Axis y: 14.1 µm rms of the planned motion lie above 60 Hz" in warning
     assert NOTABLE_UM > 0.5
 
 

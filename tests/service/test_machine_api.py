@@ -208,7 +208,9 @@ def test_only_approved_revisions_where_that_is_switched_on(tmp_path: Path):
 
 
 def pinned(folder: Path, job: dict[str, Any]) -> PinnedMachine:
-    return PinnedMachine.read(folder / "jobs" / job["id"] / "machine.json")
+    return PinnedMachine.read(
+        folder / "jobs" / job["id"] / "machine.json", job["machine"], job["machine_revision"]
+    )
 
 
 @pytest.mark.slow
@@ -234,8 +236,10 @@ def test_the_age_of_a_measurement_reaches_the_report(tmp_path: Path):
     store = MachineStore(tmp_path / "machines")
     old = make_plants(50.0, on=date(2020, 1, 31))
     store.add_revision("mine", make_machine(axes={"x": old, "y": make_plants()}), author="anna")
+    pinned = Resolver(store).for_job("mine")
     task = Task(
         machine="mine",
+        machine_revision=pinned.machine.revision,
         machine_file=tmp_path / "machine.json",
         options={"method": "none"},
         sources=(tmp_path / "upload.gcode",),
@@ -245,7 +249,7 @@ def test_the_age_of_a_measurement_reaches_the_report(tmp_path: Path):
     )
     task.target.parent.mkdir()
     task.source.write_text("G28\nG1 X50 Y50 F6000\nG1 X60 Y50 E1\nG1 X60 Y70 E2\n")
-    Resolver(store).for_job("mine").write(task.machine_file)
+    pinned.write(task.machine_file)
     store.delete("mine")
     summary = run_compensation(task, lambda progress: None)
     assert summary["headline_um"]["before"] == summary["before_um"]

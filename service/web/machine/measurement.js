@@ -25,7 +25,7 @@ export function measurementPanel({ machines, base, own = false, signal }) {
   const result = h("div", { "aria-live": "polite" });
   const look = h("button.main", { type: "submit", disabled: true }, "Look at the fit");
   const name = h("input", { type: "text", id: "new-name", required: !own, ...NAME, autocomplete: "off", spellcheck: "false", "aria-describedby": "new-name-hint" });
-  const start = h("select", { id: "base", required: true }, h("option", { value: "" }, "Choose the most alike"), machines.filter((m) => m.problem === null).map((m) => h("option", { value: m.name, selected: m.name === base }, m.title)));
+  const start = h("select", { id: "base", required: true }, h("option", { value: "" }, "Choose the most similar"), machines.filter((m) => m.problem === null).map((m) => h("option", { value: m.name, selected: m.name === base }, m.title)));
   const author = h("input", { type: "text", id: "measured-by", maxlength: "100", autocomplete: "name" });
   const test = testOptions();
   const form = h("form.card", { onsubmit: (/** @type {Event} */ event) => {

@@ -39,7 +39,7 @@ export function settingsPanel({ machine, signal }) {
     machine ? null : [
       h("div.fields", null,
         field("settings-name", "Name of your machine", name, "Small letters, digits, - and _."),
-        field("fx", "Resonance of X, Hz", fx, "If you know it; a measurement takes its place."),
+        field("fx", "Resonance of X, Hz", fx, "If you know it. A measurement replaces it."),
         field("fy", "Resonance of Y, Hz", fy)),
       marlin],
     h("div.actions", null, keep), status);

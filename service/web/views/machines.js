@@ -22,12 +22,12 @@ export async function show({ main, signal, setTitle }) {
   draw();
   fill(main,
     h("div.head", null, h("h1", null, "Machines"), h("div.find.end", null, h("label.sr", { for: "find" }, "Find a machine"), search)),
-    h("p.lead", null, "A compensator is as good as the model of the machine. Built-in machines are single printers that somebody measured; yours is another one."),
+    h("p.lead", null, "A compensator is only as good as its model of the machine. Each built-in machine is one printer that somebody measured, and yours is different."),
     list,
-    h("section", null, h("h2", null, "Make your own of the printer's settings"),
+    h("section", null, h("h2", null, "Make your own from the printer's settings"),
       h("p.hint", null, "Limits and travel come from the firmware. How the frame rings is measured afterwards, on the machine's page."),
       settingsPanel({ machine: null, signal })),
-    h("section", null, h("h2", null, "Or of measurements, with limits like another machine's"),
+    h("section", null, h("h2", null, "Or from measurements, with another machine's limits"),
       measurementPanel({ machines, base: null, signal })));
 }
 

@@ -168,7 +168,7 @@ function wayToPrint(onChange) {
   live.setAttribute("aria-describedby", "way-hint");
   const element = h("fieldset.way-choice", null, h("legend", null, "How you will print"),
     h("label.check", { for: "way-file" }, file, "Print it as a file: you get a compensated file"),
-    h("label.check", { for: "way-live" }, live, "Print it live: the file stays as sliced, an extra inside Klipper compensates"), hint);
+    h("label.check", { for: "way-live" }, live, "Print it live: the file stays as sliced, and an extra inside Klipper compensates"), hint);
   const refuse = (/** @type {string | null} */ reason) => {
     refusal = reason;
     live.disabled = reason !== null;

@@ -80,6 +80,17 @@ def test_who_asks_the_same_waits_for_the_same_job(client: TestClient) -> None:
     assert len(jobs(client, "controller")) == 1
 
 
+def test_an_answer_that_the_disk_has_damaged_is_computed_anew(client: TestClient) -> None:
+    asked = FMSDOB | {"targets_hz": [1700.0]}
+    whole = client.post(CONTROLLERS, json=asked).json()
+    job = jobs(client, "controller")[0]
+    folder: Path = client.app.state.settings.data_dir / "jobs"  # type: ignore[attr-defined]
+    (answer,) = (folder / job["id"]).glob("*/result/*")
+    answer.write_bytes(b"x" * answer.stat().st_size)
+    assert_problem(client.post(CONTROLLERS, json=asked), 503, "ask again")
+    assert client.post(CONTROLLERS, json=asked).json() == whole
+
+
 def test_what_is_refused_is_a_failed_job(client: TestClient) -> None:
     bad = FMSDOB | {"targets_hz": [19_999.0]}
     answer = client.post(CONTROLLERS, json=bad)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import socket
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -38,10 +40,7 @@ def jobs_of(client: httpx2.Client) -> list[dict[str, Any]]:
 
 
 def handed_in(client: httpx2.Client, content: bytes) -> httpx2.Response:
-    while True:
-        # Who is refused before he has sent all may not hear why.
-        with contextlib.suppress(httpx2.TransportError):
-            return client.post("/v1/jobs?machine=ender3", content=content)
+    return client.post("/v1/jobs?machine=ender3", content=content)
 
 
 def test_what_the_reserve_is_for(small_disk: Path) -> None:
@@ -163,6 +162,36 @@ def test_a_job_too_large_for_the_disk_is_told_so(
         foreign.unlink()
         until(lambda: client.get(where).json()["state"] == "done", 90)
         assert client.get(where).json()["room_bytes"] is None
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="limits the size of files")
+@pytest.mark.parametrize("head", ["Content-Length: 67108864", "Transfer-Encoding: chunked"])
+@pytest.mark.parametrize("limit", ["file", "upload"])
+def test_who_only_reads_after_sending_all_hears_why_he_was_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, head: str, limit: str
+) -> None:
+    command = PRETEND
+    if limit == "file":
+        command = ["sh", "-c", 'ulimit -f 20000 && exec "$0" "$@"', *PRETEND]  # of 512 bytes
+    else:
+        monkeypatch.setenv("STILLPATH_MAX_UPLOAD_BYTES", str(10 * MIB))
+    chunk = b";" * MIB
+    with server(command, tmp_path) as (client, _):
+        address = ("127.0.0.1", client.base_url.port)
+        with socket.create_connection(address, timeout=90) as sender:
+            start = f"POST /v1/jobs?machine=ender3 HTTP/1.1\r\nHost: localhost\r\n{head}\r\n\r\n"
+            sender.sendall(start.encode())
+            for _ in range(64):
+                sender.sendall(b"100000\r\n%s\r\n" % chunk if "chunked" in head else chunk)
+            if "chunked" in head:
+                sender.sendall(b"0\r\n\r\n")
+            with sender.makefile("rb") as answer:
+                text = answer.read().decode()
+        assert text.startswith("HTTP/1.1 507 " if limit == "file" else "HTTP/1.1 413 ")
+        assert "application/problem+json" in text
+        assert '"title": "File too large"' in text
+        assert not list((tmp_path / "incoming").iterdir())
 
 
 @pytest.mark.slow

@@ -107,8 +107,24 @@ def test_what_is_damaged_is_told(client: TestClient, data_dir: Path):
     (result,) = (folder / "result").iterdir()
     result.write_bytes(result.read_bytes()[:5])
     assert_problem(client.get(f"{where}/result"), 404, "5 bytes instead of 21")
+    result.write_bytes(b"x" * 21)
+    assert_problem(client.get(f"{where}/result"), 404, "SHA-256", "delete the job")
+    assert_problem(client.get(f"{where}/result", headers={"Range": "bytes=3-4"}), 404, "SHA-256")
     (folder / "report" / "layers.json").write_text('{"layers": [{"off')
     assert_problem(client.get(f"{where}/layers/0"), 404, "no list of layers")
+
+
+def test_what_was_sound_is_looked_at_again_when_it_was_written_to(
+    client: TestClient, data_dir: Path
+):
+    where = post(client, b"G1 X179").headers["location"]
+    done = until(client, where, over)
+    (result,) = (data_dir / "jobs" / done["id"]).glob("*/result/*")
+    content = client.get(f"{where}/result").content
+    result.write_bytes(content.swapcase())
+    assert_problem(client.get(f"{where}/result"), 404, "SHA-256")
+    result.write_bytes(content)
+    assert client.get(f"{where}/result").content == content
 
 
 def test_the_schema_of_the_report(client: TestClient):

@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 
 from stillpath.cli.main import run
+from stillpath.service.database.engine import StoreError, open_database
+from stillpath.service.settings import Settings
 from tests.service.machines import make_machine
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -75,3 +77,37 @@ def test_commands_without_a_database_do_not_load_it(arguments: list[str]):
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_lost_database_is_not_made_anew_beside_files_of_jobs(
+    data_dir: Path, capsys: pytest.CaptureFixture[str]
+):
+    assert run(["keys", "list"]) == 0
+    (data_dir / "jobs" / "7aba" / "source").mkdir(parents=True)
+    assert run(["keys", "list"]) == 0
+    (data_dir / "jobs" / "7aba" / "source" / "part.gcode").write_text("G1 X1\n")
+    assert run(["keys", "list"]) == 0
+    database, log = data_dir / "stillpath.sqlite3", data_dir / "stillpath.sqlite3-wal"
+    log.write_bytes(b"what was written last")
+    for lose in (database.unlink, database.touch):
+        lose()
+        assert run(["migrate"]) == 2
+        assert "put the database back" in capsys.readouterr().err
+        assert log.read_bytes() == b"what was written last"
+        assert not database.exists() or not database.stat().st_size
+    (data_dir / "jobs").rename(data_dir / "kept")
+    assert run(["keys", "list"]) == 0
+
+
+def test_a_wrong_database_does_not_cost_a_bucket_its_files(
+    postgres_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv("STILLPATH_DATABASE_URL", postgres_url)
+    monkeypatch.setenv("STILLPATH_STORAGE_URL", (tmp_path / "files").as_uri())
+    file = tmp_path / "files" / "jobs" / "7aba" / "source" / "part.gcode"
+    file.parent.mkdir(parents=True)
+    file.write_text("G1 X1\n")
+    with pytest.raises(StoreError, match=r"7aba.*put the database back"):
+        open_database(Settings())
+    file.unlink()
+    open_database(Settings()).dispose()

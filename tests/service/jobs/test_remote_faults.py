@@ -127,6 +127,21 @@ def test_two_services_share_the_work_and_one_may_die(far: Far):
     all_done(site, [last])
 
 
+def test_what_a_bucket_has_lost_or_damaged_is_told(far: Far):
+    site = far.site
+    ids = [site.submit(f"G1 X{n} ; as submitted") for n in range(3)]
+    gone, cut, garbled = (site.get(job_id) for job_id in ids)
+    site.storage.delete(gone.files)
+    for job, content in ((cut, b"G1 X1"), (garbled, b"G1 X7 ; as submitted")):
+        file = site.data_dir / "rubbish"
+        file.write_bytes(content)
+        site.storage.put(job.sources[0], file)
+    _ = far.scheduler(), far.workers(), far.api()
+    titles = [site.ended(job_id).problem["title"] for job_id in ids]
+    assert titles == ["The file is gone", "The file is damaged", "The file is damaged"]
+    assert all(site.get(job_id).output is None for job_id in ids)
+
+
 @pytest.mark.skipif(not hasattr(signal, "SIGQUIT"), reason="crashes PostgreSQL")
 def test_a_database_that_crashes_forgets_nothing(tmp_path: Path):
     # Short, and open to the user that PostgreSQL runs as.
