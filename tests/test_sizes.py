@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -38,12 +39,15 @@ def sources(layer: str) -> Iterator[tuple[str, str]]:
             yield path.relative_to(HERE).as_posix(), path.read_text("utf-8")
 
 
-def functions(text: str) -> Iterator[Function]:
-    for node in ast.walk(ast.parse(text)):
-        if isinstance(node, Function) and not any(
-            "njit" in ast.unparse(decorator) for decorator in node.decorator_list
-        ):
-            yield node
+@functools.cache
+def functions(layer: str) -> list[tuple[str, Function]]:
+    return [
+        (path, node)
+        for path, text in sources(layer)
+        for node in ast.walk(ast.parse(text))
+        if isinstance(node, Function)
+        and not any("njit" in ast.unparse(decorator) for decorator in node.decorator_list)
+    ]
 
 
 def parameters(function: Function) -> int:
@@ -57,8 +61,7 @@ def parameters(function: Function) -> int:
 def test_functions_are_short(layer: str) -> None:
     found = [
         f"{path}:{one.lineno} {one.name}: {one.end_lineno - one.lineno + 1} lines"
-        for path, text in sources(layer)
-        for one in functions(text)
+        for path, one in functions(layer)
         if one.end_lineno is not None and one.end_lineno - one.lineno + 1 > MOST_LINES
     ]
     assert found == [], f"more than {MOST_LINES} lines, from def to end: find the natural part"
@@ -68,8 +71,7 @@ def test_functions_are_short(layer: str) -> None:
 def test_functions_take_few_parameters(layer: str) -> None:
     found = [
         f"{path}:{one.lineno} {one.name}: {parameters(one)} parameters"
-        for path, text in sources(layer)
-        for one in functions(text)
+        for path, one in functions(layer)
         if parameters(one) > MOST_PARAMETERS
         and not (path.startswith(INTERFACES) and not one.name.startswith("_"))
     ]

@@ -122,19 +122,19 @@ def test_a_confirmation_leaves_everything_else(any_store: MachineStore):
     assert any_store.names() == ["mine"]
 
 
-@pytest.mark.parametrize("name", builtin_machines())
-def test_names_of_built_in_machines_are_reserved(any_store: MachineStore, name: str):
-    with pytest.raises(Conflict, match="built-in"):
-        any_store.add_revision(name, load_machine(name), author="anna")
+def test_names_of_built_in_machines_are_reserved(any_store: MachineStore):
+    for name in builtin_machines():
+        with pytest.raises(Conflict, match="built-in"):
+            any_store.add_revision(name, load_machine(name), author="anna")
 
 
-@pytest.mark.parametrize("name", ["", "..", "../x", "a/b", "Mine", "x" * 65, ".trash", "mine\n"])
-def test_what_cannot_be_a_name(any_store: MachineStore, name: str):
-    assert name not in any_store
-    with pytest.raises(ModelError, match="cannot be a machine's name"):
-        any_store.add_revision(name, make_machine(), author="anna")
-    with pytest.raises(UnknownMachine):
-        any_store.current(name)
+def test_what_cannot_be_a_name(any_store: MachineStore):
+    for name in ("", "..", "../x", "a/b", "Mine", "x" * 65, ".trash", "mine\n"):
+        assert name not in any_store
+        with pytest.raises(ModelError, match="cannot be a machine's name"):
+            any_store.add_revision(name, make_machine(), author="anna")
+        with pytest.raises(UnknownMachine):
+            any_store.current(name)
 
 
 def test_a_machine_keeps_its_name(any_store: MachineStore):

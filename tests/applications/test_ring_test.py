@@ -140,7 +140,10 @@ def test_a_sensor_that_one_axis_does_not_move_says_nothing_of_it(
     assert "it is not fixed to the part that moves in Y" in report.axes[1].text
 
 
-@pytest.mark.parametrize("what", ["another motion", "part of it", "noise"])
+@pytest.mark.parametrize(
+    "what",
+    ["another motion", *(pytest.param(w, marks=pytest.mark.slow) for w in ("part of it", "noise"))],
+)
 def test_logs_that_say_nothing(what: str, ring: Path, machine: Machine, tmp_path: Path) -> None:
     if what == "part of it":
         record, words = recorded(ring, machine, part_s=(0.0, 15.0)), "log the whole file"

@@ -77,7 +77,12 @@ def test_wild_prints(pipeline: Pipeline, seed: int) -> None:
 
 @pytest.mark.shared
 @pytest.mark.parametrize(
-    "name", ["klipper_excludeobj_multi", "cura_ender3_gear24", "ps_ender3_gear24_absE"]
+    "name",
+    [
+        "klipper_excludeobj_multi",
+        pytest.param("cura_ender3_gear24", marks=pytest.mark.slow),
+        "ps_ender3_gear24_absE",
+    ],
 )
 def test_real_prints(pipeline: Pipeline, shared_dir: Path, name: str) -> None:
     data = gzip.decompress((shared_dir / "corpus" / "own" / f"{name}.gcode.gz").read_bytes())

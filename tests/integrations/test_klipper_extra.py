@@ -47,7 +47,14 @@ def given(taps: np.ndarray, accel: float = 1e5) -> Any:
     )  # fmt: skip
 
 
-@pytest.mark.parametrize(("accel", "batch"), [(1e5, 250), (5200.0, 250), (5200.0, 37)])
+@pytest.mark.parametrize(
+    ("accel", "batch"),
+    [
+        pytest.param(1e5, 250, marks=pytest.mark.slow),
+        pytest.param(5200.0, 250, marks=pytest.mark.slow),
+        (5200.0, 37),
+    ],
+)
 def test_it_filters_as_the_prediction_does(extra: ModuleType, accel: float, batch: int) -> None:
     taps = np.stack([design_taps([mode(f, 0.05)], np.ones(1), 150.0) for f in (45.0, 30.0)])
     bounds = [(-1e3, 1e3)] * 2

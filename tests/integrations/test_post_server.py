@@ -267,10 +267,21 @@ def test_keys(running: Running, part: Path, tmp_path: Path):
     ],
 )
 def test_broken_transfers(
-    running: Running, part: Path, tmp_path: Path, oddity: str, code: int, word: str
+    running: Running, part: Path, tmp_path: Path, monkeypatch, capsys, oddity: str, code: int, word
 ):
-    done = post(*running.odd(oddity), "--timeout", "5", part, home=tmp_path)
-    assert_reason(done, code, word)
+    real = stillpath_post.Service._open
+
+    def patient(self: Any, *request: Any, timeout_s: float = 0.0) -> Any:
+        return real(self, *request, timeout_s=60.0)  # a busy computer answers late
+
+    monkeypatch.setattr(stillpath_post.Service, "_open", patient)
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    arguments = [*running.odd(oddity), "--timeout", "1", str(part)]
+    assert stillpath_post.main(arguments) == code
+    said = capsys.readouterr().err
+    assert said.startswith("stillpath-post: ")
+    assert said.count("\n") == 1
+    assert word in said
     assert_untouched(part)
     until(lambda: not running.job_ids())
 

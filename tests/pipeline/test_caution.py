@@ -78,7 +78,7 @@ def test_a_wide_set_asks_for_more_of_the_shaper(tmp_path: Path) -> None:
     assert narrow.mean < wide.mean <= wide.worst
 
 
-@pytest.mark.parametrize("name", ["ender3", "voron-v24-250"])
+@pytest.mark.parametrize("name", ["ender3", pytest.param("voron-v24-250", marks=pytest.mark.slow)])
 def test_no_member_fares_worse_than_with_the_shaper(name: str, cache: Path) -> None:
     """The promise, member by member, measured without the code that made the choice."""
     machine = load_machine(name)

@@ -118,7 +118,7 @@ def test_the_firmwares_shaper_is_not_switched_between_walls(gear: Path, tmp_path
     assert target.read_bytes().count(b"SET_INPUT_SHAPER") <= 6
 
 
-@pytest.mark.parametrize("kind", ["marlin", "reprapfirmware"])
+@pytest.mark.parametrize("kind", [pytest.param("marlin", marks=pytest.mark.slow), "reprapfirmware"])
 def test_what_is_left_out_has_the_firmwares_pressure_advance(
     kind: str, gear: Path, tmp_path: Path
 ) -> None:

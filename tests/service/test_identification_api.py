@@ -190,8 +190,9 @@ def test_what_is_no_form(client: TestClient, data: Path) -> None:
 
 def test_names_of_files_are_only_names(client: TestClient, data: Path) -> None:
     before = kept(data)
-    for name in ("../../raw_data_x_1.csv", "C:\\raw_data_x_1.csv", "raw_data_x_\n1.csv"):
-        answer = post(client, InputFile(name, quick_raw("x").content), trial=True)
+    for name in ("../../taz_x.json", "C:\\taz_x.json", "taz_x\n.json"):
+        file = InputFile(name, TAZ.encode())
+        answer = post(client, file, trial=True, axis="x", repair_rounding=True)
         assert answer.status_code == 200, answer.text
         (source,) = answer.json()["report"]["sources"]
         assert not set(source["name"]) & set("/\\\n")
@@ -208,7 +209,8 @@ def test_a_printed_model_is_repaired_on_request(client: TestClient) -> None:
 
 
 def test_a_damaged_archive_is_told(client: TestClient, data: Path) -> None:
-    assert post(client, quick_raw("x")).status_code == 201
+    model = InputFile("taz_x.json", TAZ.encode())
+    assert post(client, model, repair_rounding=True).status_code == 201
     (file,) = (data / "identifications").iterdir()
     file.write_text("{")
     assert_problem(client.get(f"{MINE}/identification"), 422, file.name, "damaged")

@@ -171,7 +171,14 @@ def test_a_sensor_that_is_only_shaken_along_has_its_own_message() -> None:
         estimate_response(log, SHORT)
 
 
-@pytest.mark.parametrize("rate_hz_s", [0.985, 0.998, 1.015])
+@pytest.mark.parametrize(
+    "rate_hz_s",
+    [
+        pytest.param(0.985, marks=pytest.mark.slow),
+        0.998,
+        pytest.param(1.015, marks=pytest.mark.slow),
+    ],
+)
 def test_a_sweep_that_drifts_away_has_its_own_message(rate_hz_s: float) -> None:
     like = r"drifts away from .* like hz_per_sec = (1|0\.999\d|1\.000\d):"
     with pytest.raises(ModelError, match=like):

@@ -85,7 +85,7 @@ def test_order_follows_what_the_noise_leaves_to_see() -> None:
     assert fit_response(measured(modal(TRUTH[:1], (1.0,)), noise=0.03)).order == 1
 
 
-@pytest.mark.parametrize("delay_s", [-3e-3, 0.0, 8e-3])
+@pytest.mark.parametrize("delay_s", [-3e-3, pytest.param(0.0, marks=pytest.mark.slow), 8e-3])
 def test_delay_is_set_aside(delay_s: float) -> None:
     fit = fit_response(measured(modal(TRUTH[:2], (0.7, 0.3)), delay_s=delay_s))
     assert fit.delay_s == pytest.approx(delay_s, abs=0.1e-3)

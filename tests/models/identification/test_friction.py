@@ -48,7 +48,9 @@ def logs(  # type: ignore[no-untyped-def]
     return out
 
 
-@pytest.mark.parametrize("test", [OLD_TEST, NEW_TEST], ids=["old", "new"])
+@pytest.mark.parametrize(
+    "test", [pytest.param(OLD_TEST, marks=pytest.mark.slow), NEW_TEST], ids=["old", "new"]
+)
 def test_it_is_told_by_the_log(test: Excitation) -> None:
     printer = draw("bed slinger", 3)
     read = logs(printer, test, runs=2)
@@ -61,7 +63,7 @@ def test_it_is_told_by_the_log(test: Excitation) -> None:
     assert np.mean(1 - again.coherence[low]) < 0.9 * np.mean(1 - response.coherence[low])
 
 
-@pytest.mark.parametrize("seed", [2, 8])
+@pytest.mark.parametrize("seed", [2, pytest.param(8, marks=pytest.mark.slow)])
 def test_a_frame_that_shakes_does_not_hide_it(seed: int) -> None:
     """The sensor on a bed feels the frame too, at 8 Hz where friction shows most."""
     printer = draw("bed slinger", seed)
@@ -82,7 +84,7 @@ def test_guides_that_do_not_rub_have_none() -> None:
     assert mean_response([one[2] for one in read]).f_hz[0] < 10
 
 
-@pytest.mark.parametrize("times", [4.0, 8.0])
+@pytest.mark.parametrize("times", [pytest.param(4.0, marks=pytest.mark.slow), 8.0])
 def test_strong_friction_delays_the_fundamental_which_alignment_takes_for_a_later_start(
     times: float,
 ) -> None:

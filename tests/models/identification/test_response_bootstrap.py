@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from stillpath.models.identification.identify import Measured, identify
 from stillpath.models.identification.readers import ReadSettings
@@ -12,6 +13,7 @@ from stillpath.simulation.printers.drawing import draw
 from stillpath.simulation.printers.resonance_test import OLD_TEST, drawn_sensor, run_test
 
 
+@pytest.mark.slow
 def test_all_members_have_the_resonance_that_was_measured() -> None:
     """In noisy logs fits to what might have come out lose their way: they find 7 or 130 Hz."""
     printer, rng = draw("bed slinger", 17), np.random.default_rng(7)

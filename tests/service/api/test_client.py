@@ -381,7 +381,10 @@ def test_the_commands_of_jobs(address: str, client: Client, tmp_path: Path):
 
 
 @pytest.mark.skipif(os.name != "posix", reason="sends signals")
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("number", "code"),
+    [pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow), (signal.SIGTERM, 143)],
+)
 def test_an_interrupted_command_cancels_its_job(
     address: str, client: Client, tmp_path: Path, number: int, code: int
 ):

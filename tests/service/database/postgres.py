@@ -107,7 +107,9 @@ class PostgresServer:
 
         name = f"t{uuid.uuid4().hex[:12]}"
         with psycopg.connect(self._dsn("postgres"), autocommit=True) as connection:
-            connection.execute(f"CREATE DATABASE {name}".encode())
+            # As before PostgreSQL 15: several times as quick where nothing is forced to disk.
+            strategy = "STRATEGY FILE_COPY" if connection.info.server_version >= 150_000 else ""
+            connection.execute(f"CREATE DATABASE {name} {strategy}".encode())
         return f"postgresql+psycopg://stillpath@127.0.0.1:{self.port}/{name}"
 
     def drop_database(self, url: str) -> None:
