@@ -15,6 +15,7 @@ from typing import Any
 
 import psutil
 
+from stillpath.applications.machines.resolve import PinnedMachine
 from stillpath.service.database.engine import DatabaseAway, open_database
 from stillpath.service.jobs.state import Cancelled, Job, JobState
 from stillpath.service.jobs.store import JobStore
@@ -56,8 +57,8 @@ class Site:
     def close(self) -> None:
         self.engine.dispose()
 
-    def submit(self, text: str, **fields: Any) -> str:
-        """Do what the API does: the file first, then the row."""
+    def submit(self, text: str, machine: PinnedMachine | None = None, **fields: Any) -> str:
+        """Do what the API does: the files first, then the row."""
         content = text.encode()
         given = {
             "created_at": time.time(),
@@ -65,10 +66,16 @@ class Site:
             "source_bytes": len(content),
             "source_sha256": hashlib.sha256(content).hexdigest(),
         }
+        if machine is not None:
+            given["machine_revision"] = machine.machine.revision
         job = make_job(**(given | fields))
         upload = self.data_dir / f"upload-{job.id}"
         upload.write_bytes(content)
         self.storage.put(f"jobs/{job.id}/source/part.gcode", upload)
+        if machine is not None:
+            pinned = self.data_dir / f"machine-{job.id}"
+            machine.write(pinned)
+            self.storage.put(job.machine_file, pinned)
         self.store.add(job)
         return job.id
 

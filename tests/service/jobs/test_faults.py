@@ -14,6 +14,7 @@ from pathlib import Path
 import psutil
 import pytest
 
+from stillpath.applications.machines.resolve import PinnedMachine
 from stillpath.models.store import load_machine
 from stillpath.service.database.engine import DatabaseAway
 from stillpath.service.jobs.state import JobState
@@ -190,8 +191,7 @@ def test_the_real_road_survives_the_death_of_its_worker(site: Site):
         "0",
     ]
     with site.process(main) as process:
-        revision = load_machine("ender3").revision
-        job_id = site.submit(source.read_text(), machine_revision=revision)
+        job_id = site.submit(source.read_text(), PinnedMachine(machine=load_machine("ender3")))
         job = until(lambda: (j := site.running(job_id)).stage == "compensating" and j)
         os.kill(worker_pid_of(job.worker), signal.SIGKILL)
         job = site.ended(job_id, 600)
