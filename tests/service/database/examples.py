@@ -6,6 +6,7 @@ import time
 import uuid
 from typing import Any
 
+from stillpath.models.store import load_machine
 from stillpath.service.jobs.state import Finished, Job
 from stillpath.service.jobs.store import JobStore
 
@@ -18,7 +19,7 @@ def make_job(**fields: Any) -> Job:
         "id": uuid.uuid4().hex,
         "owner": "anna",
         "machine": "ender3",
-        "machine_revision": "0123456789ab",
+        "machine_revision": load_machine("ender3").revision,
         "options": {"method": "fbf"},
         "dedupe_key": "d" * 64,
         "source_name": "part.gcode",

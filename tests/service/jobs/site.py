@@ -66,8 +66,6 @@ class Site:
             "source_bytes": len(content),
             "source_sha256": hashlib.sha256(content).hexdigest(),
         }
-        if machine is not None:
-            given["machine_revision"] = machine.machine.revision
         job = make_job(**(given | fields))
         upload = self.data_dir / f"upload-{job.id}"
         upload.write_bytes(content)
