@@ -13,11 +13,11 @@ from stillpath.models.identification.averaging import mean_response, mean_spectr
 from stillpath.models.identification.sets import (
     Origin,
     delay_warning,
+    model_file_set,
     parametric_members,
     plant_set_from,
     response_set,
     spectrum_set,
-    typed_in_set,
 )
 from stillpath.models.identification.spectrum_fit import explanations
 from stillpath.models.identification.synthetic import Sensor, simulate_spectrum
@@ -154,13 +154,11 @@ def test_spectra_of_different_tests_have_no_mean() -> None:
         explanations(pair, [TEST, replace(TEST, accel_per_hz_mm_s=60.0)])
 
 
-def test_typed_in_is_trusted_least() -> None:
-    made = typed_in_set(plant())
+def test_a_model_that_was_read_is_varied() -> None:
+    made = model_file_set(plant())
     assert made.provenance is not None
-    assert made.provenance.kind == "typed in"
-    assert made.members == parametric_members("typed in")
-    scales = parametric_members("typed in")
-    assert max(scales.frequency_scale) - 1 == pytest.approx(0.07)
+    assert made.provenance.kind == "model file"
+    assert made.members == parametric_members("model file")
     assert len(made.weighted_members()) == 9
 
 
