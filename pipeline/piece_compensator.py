@@ -7,14 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter1d
 
 from stillpath.compensation.base import Compensator, DesignError
 from stillpath.compensation.cautious import Caution
 from stillpath.compensation.registry import compensator
 from stillpath.compensation.scheduled import BLEND_STEP, DESIGN_STEP
 from stillpath.gcode.errors import GcodeError
-from stillpath.gcode.firmware.base import FirmwareAdapter
 from stillpath.gcode.firmware.encoding import Encoded
 from stillpath.gcode.firmware.planning import intended
 from stillpath.gcode.firmware.registry import adapter
@@ -29,6 +27,7 @@ from stillpath.models.plants import plant_set
 from stillpath.models.runs import runs
 from stillpath.models.schedule import EMPTY, OperatingPoint
 from stillpath.pipeline.caution import design_mode, set_or_nominal
+from stillpath.pipeline.following import follow_tolerance_mm, strayed
 from stillpath.pipeline.measuring._peak_kernels import peaks, speed_step
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.pipeline.options import Options
@@ -40,8 +39,6 @@ __all__ = [
     "Unfit",
     "as_executed",
     "deviation",
-    "follow_tolerance_mm",
-    "strayed",
 ]
 
 DT_S = 1e-3
@@ -59,12 +56,6 @@ _FEED_REACH, _FEED_REACH_MM = 2.5, 0.5
 """Half-width of the smoothing of filament along the path: a multiple of the filament per mm of
 path, and the most in mm."""
 _ROUNDED = 1.0 + 1e-9
-_EXTRUDING_EXCESS_MM = 20e-3
-_TRAVEL_EXCESS_MM = 200e-3
-"""Largest distance of the executed motion from the command beyond the tolerance."""
-_BRIEFLY, _BRIEF_S, _BRIEF_RMS = 2.0, 1.0, 0.25
-"""Twice that distance while extruding is allowed where its rms over a second is a quarter of it:
-less acceleration for a whole piece costs more than some hundredths of a second at its start."""
 
 
 class Unfit(ValueError):
@@ -173,6 +164,8 @@ class PieceCompensator:
                 first = first or error
                 break
         self.compensator.ease(1.0)
+        with contextlib.suppress(_Sudden, DesignError):
+            return self._compensate(piece, briefly=True)
         for soft_s in _SOFT_S:
             with contextlib.suppress(_Sudden, DesignError):
                 return self._compensate(piece, soft_s)
@@ -190,8 +183,13 @@ class PieceCompensator:
             nodes = self._grid.at_level(level)
             self._filter = _error_filter(machine_at(self._machine, nodes[len(nodes) // 2]))
 
-    def _compensate(self, piece: Piece, soft_s: float = 0.0) -> CompensatedPiece:
-        """Compensate the path, or its moving mean over `soft_s` on either side."""
+    def _compensate(
+        self, piece: Piece, soft_s: float = 0.0, *, briefly: bool = False
+    ) -> CompensatedPiece:
+        """Compensate the path, or its moving mean over `soft_s` on either side.
+
+        The motion may stray from its command `briefly`.
+        """
         phases = intended(piece.phases, piece.moves.start_mm, piece.moves.end_mm, self._step_mm)
         groups = group_rows(phases)
         resting = np.array([group.rest for group in groups])
@@ -227,7 +225,8 @@ class PieceCompensator:
         row = timeline.row[np.minimum(at, len(timeline.row) - 1)]
         self._check_travel(encoded.position[:, :2].T / 1e6, row, piece)
         made = CompensatedPiece(timeline, command, extruding, segments, encoded, step_mm, bend_mm)
-        reason = strayed(deviation(made, encoded.phases), extruding, self._follow_mm)
+        gap_mm = deviation(made, encoded.phases)
+        reason = strayed(gap_mm, extruding, self._follow_mm, briefly=briefly)
         if reason is not None:
             raise _Sudden(f"planned by the firmware's rules, {reason}")
         return made
@@ -402,45 +401,6 @@ def _feed_evenly(command: NDArray[np.float64], extruding: NDArray[np.bool_]) -> 
         wide = reach > 1e-3
         fed_mm[wide] = ((high - low)[wide]) / (2.0 * reach[wide])
         command[3, span] = command[3, span.start] + fed_mm
-
-
-def follow_tolerance_mm(firmware: FirmwareAdapter, tolerance_um: float) -> float:
-    """Return how far executed motion may normally be from its command.
-
-    Rounding of vertices to steps, and the timing of steps, each add up to one step. Moves below the
-    shortest one are merged, which adds up to its length there and back.
-    """
-    coarse_mm = max(2.0 * np.hypot(*firmware.step_mm[:2]), 2.0 * firmware.shortest_move_mm)
-    return 1e-3 * tolerance_um + float(coarse_mm)
-
-
-def strayed(
-    gap_mm: NDArray[np.float64], extruding: NDArray[np.bool_], tolerance_mm: float
-) -> str | None:
-    """Return a message if motion is too far from its command; else None.
-
-    Parameters
-    ----------
-    gap_mm : ndarray, shape (n,)
-        From `deviation`.
-    extruding : ndarray of bool, shape (n,)
-    tolerance_mm : float
-        From `follow_tolerance_mm`.
-    """
-    worst = float(np.max(gap_mm, initial=0.0))
-    most_mm = tolerance_mm + _EXTRUDING_EXCESS_MM
-    if worst <= most_mm:
-        return None
-    printing = np.where(extruding, gap_mm, 0.0)
-    printed = float(np.max(printing, initial=0.0))
-    if worst <= tolerance_mm + _TRAVEL_EXCESS_MM and printed <= _BRIEFLY * most_mm:
-        squared = uniform_filter1d(printing**2, round(_BRIEF_S / DT_S), mode="constant")
-        if printed <= most_mm or squared.max() <= (_BRIEF_RMS * most_mm) ** 2:
-            return None
-    return (
-        f"the motion is {1e3 * printed:.1f} µm from its command while extruding and "
-        f"{1e3 * worst:.1f} µm at worst (tolerance {1e3 * tolerance_mm:g} µm)"
-    )
 
 
 def deviation(piece: CompensatedPiece, executed: Phases) -> NDArray[np.float64]:

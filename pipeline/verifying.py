@@ -10,14 +10,9 @@ from stillpath.gcode.pieces import Piece
 from stillpath.gcode.types import Phases
 from stillpath.models.machine import Machine
 from stillpath.models.schedule import OperatingPoint
+from stillpath.pipeline.following import follow_tolerance_mm, strayed
 from stillpath.pipeline.measuring.points import MotionSamples
-from stillpath.pipeline.piece_compensator import (
-    DT_S,
-    CompensatedPiece,
-    Unfit,
-    follow_tolerance_mm,
-    strayed,
-)
+from stillpath.pipeline.piece_compensator import DT_S, CompensatedPiece, Unfit
 from stillpath.simulation.measures import MotionMeter
 from stillpath.simulation.scheduled import MachineStream
 
@@ -75,7 +70,8 @@ class Verifier:
         Unfit
             With the reason.
         """
-        if (reason := strayed(gap_mm, made.extruding, self._tolerance_mm)) is not None:
+        reason = strayed(gap_mm, made.extruding, self._tolerance_mm, briefly=True)
+        if reason is not None:
             raise Unfit(f"read back, {reason}")
         timeline, begins_s = made.timeline, float(made.timeline.start_s[0])
         lasts_s = float(timeline.end_s[-1] - timeline.start_s[-1])

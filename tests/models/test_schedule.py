@@ -143,11 +143,11 @@ def test_two_runs_find_the_mass(m0: float, dm: float, f0: float) -> None:
 
 def test_two_runs_propagate_their_scatter() -> None:
     f1 = 35.0 * MASS.factor(0.5)
-    found = moving_mass_from_two_runs(35.0, f1, 0.5, f0_sd_hz=0.1, f1_sd_hz=0.15, added_sd_kg=0.002)
+    found = moving_mass_from_two_runs(35.0, f1, 0.5, f0_sd_hz=0.1, f1_sd_hz=0.15)
     rng = np.random.default_rng(5)
     n = 200_000
     a, b = rng.normal(35.0, 0.1, n), rng.normal(f1, 0.15, n)
-    drawn = rng.normal(0.5, 0.002, n) / ((a / b) ** 2 - 1)
+    drawn = 0.5 / ((a / b) ** 2 - 1)
     assert found.mass_kg == pytest.approx(0.8, rel=1e-9)
     assert found.sd_kg == pytest.approx(np.std(drawn), rel=0.03)
 

@@ -12,8 +12,9 @@ from stillpath.models.firmware import RepRapFirmware
 from stillpath.models.firmware.reprapfirmware import Drive
 from stillpath.models.machine import AxisTravel, CommandLimits, Machine
 from stillpath.models.store import load_machine
+from stillpath.pipeline.following import strayed
 from stillpath.pipeline.options import Options
-from stillpath.pipeline.piece_compensator import PieceCompensator, deviation, strayed
+from stillpath.pipeline.piece_compensator import PieceCompensator, deviation
 from tests.compensating import compensated
 from tests.gcode.cutting import HEAD, pieces_of
 
@@ -119,4 +120,6 @@ def test_motion_may_leave_its_command_only_briefly(
 ) -> None:
     gap_mm = np.zeros(5000)
     gap_mm[:lasts] = 1e-3 * apart_um
-    assert (strayed(gap_mm, np.ones(5000, np.bool_), 2e-3) is None) is allowed
+    extruding = np.ones(5000, np.bool_)
+    assert (strayed(gap_mm, extruding, 2e-3, briefly=True) is None) is allowed
+    assert (strayed(gap_mm, extruding, 2e-3) is None) is (apart_um <= 22.0)
