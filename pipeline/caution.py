@@ -209,7 +209,22 @@ def prediction_note(machine: Machine, choice: Choice) -> str:
         "explain the measurement. On a test motion (delays between the axes left out), the contour "
         f"error of every plant is at most {choice.worst_to_none:.2f} of that without compensation; "
         f"it is {choice.mean:.2f} of the shaper's on average ({choice.worst:.2f} for the worst "
-        "plant)."
+        f"plant).{_friction_unseen(machine)}"
+    )
+
+
+def _friction_unseen(machine: Machine) -> str:
+    unseen = [
+        axis.upper()
+        for axis, plants in sorted(machine.axes.items())
+        if plants.provenance and plants.provenance.magnitude_only and not plants.friction_mm
+    ]
+    if not unseen:
+        return ""
+    return (
+        f" {' and '.join(unseen)}: resonance tables do not show dry friction. Guides that rub can "
+        "add 5 to 20 um to these figures, with a shaper too. Raw logs show it, and then it is "
+        "compensated (docs/identification.md)."
     )
 
 
