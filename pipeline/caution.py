@@ -223,7 +223,7 @@ def _friction_unseen(machine: Machine) -> str:
         return ""
     return (
         f" {' and '.join(unseen)}: resonance tables do not show dry friction. Guides that rub can "
-        "add 5 to 20 µm to these figures, with a shaper too. Raw logs show it, and then it is "
+        "add 10 µm and more to these figures, with a shaper too. Raw logs show it, and then it is "
         "compensated (docs/identification.md)."
     )
 
