@@ -8,7 +8,6 @@ bad for any. The error ratio of the worst member is stored with the choice.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -24,11 +23,17 @@ from stillpath.compensation.defaults import DEFAULT_BASIS
 from stillpath.compensation.fbf import PreviewFbf
 from stillpath.compensation.friction import against_friction
 from stillpath.compensation.shapers import ShaperCompensator
-from stillpath.models.friction import DryFriction
 from stillpath.models.machine import CommandLimits, Machine
 from stillpath.models.plants import DiscretePlant, PlantSetSpec, plant_set
 from stillpath.models.reference_motion import reference_motion_of
 from stillpath.models.typed_in import stated_hz
+from stillpath.pipeline.error_range import (
+    ErrorRange,
+    error_ranges,
+    phase_unseen,
+    side_by_side,
+    unseen_friction_mm,
+)
 from stillpath.pipeline.files import kept
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.pipeline.options import Options
@@ -44,10 +49,8 @@ __all__ = [
     "caution_for",
     "choose_caution",
     "design_mode",
-    "error_ranges",
     "measured_set",
     "most_share",
-    "nominal_response",
     "prediction_note",
     "set_or_nominal",
     "stated_note",
@@ -59,7 +62,7 @@ Pair: TypeAlias = tuple[DiscretePlant, DiscretePlant]
 Shares: TypeAlias = tuple[float, float]
 """Share of a command in its mixture with the shaper's, for X and Y."""
 
-_VERSION = 10
+_VERSION = 11
 _SHARES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.2, 0.0)
 _UNSEEN_SHARE = 0.85
 """Largest share where the phase was not measured: a set cannot warn of what it does not contain."""
@@ -69,12 +72,6 @@ each other: fully protecting the least likely one would mean not compensating th
 _COARSE_UM, _LEAST_FIT = 4.0, 0.5
 """Contour error from which segments may use their full tolerance, and the least share of it below:
 on a well-known machine the segments would otherwise be the larger error."""
-_FRICTION_UNSURE = 0.25
-"""Relative error of identified friction: typically 10 % on virtual printers, rarely 25 %."""
-_STEPS_UNSURE = 0.2
-"""Relative spread over the members of the error caused by whole motor steps: a guess."""
-_LAG_UNSURE_S = 1.5e-4
-"""Unknown delay of X against Y: alignment sets both to 0, but viscous guides may delay one."""
 _STRIDE = 5
 _NO_RESTS = np.zeros((0, 2), np.int64)
 
@@ -94,11 +91,8 @@ class Choice:
         Largest ratio to the contour error without compensation.
     rms_um : float
         Contour error, weighted geometric mean over the members.
-    ranges : dict
-        By channel of a report, least and largest ratio of the members' contour error (delays
-        included) to the nominal plants' with the same command.
-    reference_um : dict
-        By channel, the nominal plants' contour error on the reference motion [um].
+    ranges : dict of str to ErrorRange
+        By channel of a report.
     """
 
     shares: Shares
@@ -106,8 +100,7 @@ class Choice:
     mean: float
     worst_to_none: float
     rms_um: float
-    ranges: dict[str, tuple[float, float]] = field(default_factory=dict)
-    reference_um: dict[str, float] = field(default_factory=dict)
+    ranges: dict[str, ErrorRange] = field(default_factory=dict)
 
     @property
     def fit_share(self) -> float:
@@ -120,26 +113,15 @@ class Choice:
         return float(np.clip(self.rms_um / _COARSE_UM, _LEAST_FIT, 1.0))
 
     def ranged(self, channels: Sequence[Channel], *, steps: bool) -> list[Channel]:
-        """Return the channels of a report with the range over the members.
-
-        The error of a command differs between members; what whole motor steps add to it hardly
-        does. The two are told apart by the command's error on the reference motion, scaled by the
-        uncompensated error of this print.
-        """
+        """Return the channels of a report with the range over the members."""
         before_um = next(c.judged_rms_um for c in channels if c.name == "before")
-        harder = before_um / max(self.reference_um.get("before", 0.0), 1e-9)
+        reference = self.ranges.get("before")
+        harder = before_um / max(reference.reference_um, 1e-9) if reference else 1.0
         updated = []
         for channel in channels:
             if channel.name in self.ranges:
-                all_um = channel.judged_rms_um
-                own_um = min(all_um, harder * self.reference_um[channel.name]) if steps else all_um
-                rounded_um = math.sqrt(all_um**2 - own_um**2)
-                low, high = self.ranges[channel.name]
-                least, most = 1.0 - _STEPS_UNSURE, 1.0 + _STEPS_UNSURE
-                um = (
-                    math.hypot(low * own_um, least * rounded_um),
-                    math.hypot(high * own_um, most * rounded_um),
-                )
+                known = self.ranges[channel.name]
+                um = known.around_um(channel.judged_rms_um, harder, steps=steps)
                 channel = channel.model_copy(update={"contour_range_um": um})
             updated.append(channel)
         return updated
@@ -214,17 +196,18 @@ def prediction_note(machine: Machine, choice: Choice) -> str:
 
 
 def _friction_unseen(machine: Machine) -> str:
-    unseen = [
-        axis.upper()
+    unseen_um = {
+        axis.upper(): 1e3 * unseen_friction_mm(plants)
         for axis, plants in sorted(machine.axes.items())
-        if plants.provenance and plants.provenance.magnitude_only and not plants.friction_mm
-    ]
-    if not unseen:
+    }
+    held = " and ".join(f"{um:.0f} µm ({axis})" for axis, um in unseen_um.items() if um)
+    if not held:
         return ""
     return (
-        f" {' and '.join(unseen)}: resonance tables do not show dry friction. Guides that rub can "
-        "add 10 µm and more to these figures, with a shaper too. Raw logs show it, and then it is "
-        "compensated (docs/identification.md)."
+        " Resonance tables do not show dry friction. The upper ends of the ranges, those without "
+        f"compensation and with a shaper too, include guides that hold an axis back by {held}; "
+        "more is possible. Raw logs show friction, and then it is compensated "
+        "(docs/identification.md)."
     )
 
 
@@ -254,7 +237,7 @@ def choose_caution(
 
 
 def _read(document: dict[str, Any]) -> Choice:
-    ranges = {name: (low, high) for name, (low, high) in document["ranges"].items()}
+    ranges = {name: ErrorRange(**known) for name, known in document["ranges"].items()}
     return Choice(**{**document, "shares": tuple(document["shares"]), "ranges": ranges})
 
 
@@ -285,7 +268,7 @@ class Mixtures:
         self._distances = PathDistances(path_mm, dt_s)
         # A delay between the axes adds the same error to all commands: it cannot rank them.
         axes = [machine.axes[axis].without_delay() for axis in ("x", "y")]
-        self._pairs = _side_by_side(*(plant_set(axis, dt_s).members for axis in axes))
+        self._pairs = side_by_side(*(plant_set(axis, dt_s).members for axis in axes))
         self._weights = _pair_weights(machine, len(self._pairs))
         self._smooth = self.answers(smooth_mm)
         self.shaped_mm = np.maximum(self.errors_mm(self._smooth), 1e-12)
@@ -353,17 +336,7 @@ def _tried(machine: Machine, shaper: BestShaper, dt_s: float, basis: str) -> Cho
     return replace(
         best,
         ranges=error_ranges(machine, channels, mixtures.rms_mm, dt_s),
-        reference_um={
-            name: 1e3 * mixtures.rms_mm(nominal_response(machine, command, dt_s))
-            for name, command in channels.items()
-        },
     )
-
-
-def nominal_response(machine: Machine, command: Array, dt_s: float) -> Array:
-    """Return the nominal plants' response to a command, dry friction included."""
-    pair = [plant_set(machine.axes[axis], dt_s).nominal for axis in ("x", "y")]
-    return response(pair, _received(machine, command))
 
 
 def _commands(
@@ -403,50 +376,6 @@ def _strong(machine: Machine) -> Machine:
     return machine.model_copy(update={"command": command})
 
 
-def error_ranges(
-    machine: Machine, commands: dict[str, Array], rms: Callable[[Array], float], dt_s: float
-) -> dict[str, tuple[float, float]]:
-    """Return least and largest error of the members relative to the nominal plants', by command.
-
-    Known friction varies between the members too, and so does the delay between the axes, which
-    alignment cannot see.
-
-    Parameters
-    ----------
-    commands : dict of str to ndarray, shape (2, n)
-    rms : callable
-        Maps positions (2, n) to their rms error.
-    """
-    x, y = (plant_set(machine.axes[axis], dt_s) for axis in ("x", "y"))
-    pairs = _side_by_side(x.members, y.members)
-    sides = np.where(np.arange(len(pairs)) % 2, 1.0, -1.0)
-    # Sets without measured phase already include delays.
-    lag_s = 0.0 if any(map(_unseen, machine.axes.values())) else _LAG_UNSURE_S
-    out = {}
-    for name, command in commands.items():
-        nominal = max(rms(nominal_response(machine, command, dt_s)), 1e-12)
-        ratios = []
-        for pair, side in zip(pairs, sides, strict=True):
-            received = _received(machine, command, 1.0 + _FRICTION_UNSURE * side)
-            ratios.append(rms(_delayed(response(pair, received), side * lag_s / dt_s)) / nominal)
-        out[name] = (min(1.0, *ratios), max(1.0, *ratios))
-    return out
-
-
-def _received(machine: Machine, command: Array, share: float = 1.0) -> Array:
-    """Return a command after dry friction; `share` scales the measured friction."""
-    return DryFriction([share * held for held in machine.friction_mm]).received_mm(command)
-
-
-def _delayed(y: Array, samples: float) -> Array:
-    """Return a motion (2, n) with X delayed by `samples`; if negative, Y is delayed instead."""
-    row = 0 if samples > 0.0 else 1
-    delayed = y.copy()
-    at = np.arange(y.shape[1], dtype=float)
-    delayed[row] = np.interp(at - abs(samples), at, y[row])
-    return delayed
-
-
 def _rank(choice: Choice) -> float:
     """Return the cost of a choice: the mean over likely members plus the worst one's excess."""
     return choice.mean + _PRICE * max(0.0, choice.worst - 1.0)
@@ -456,13 +385,7 @@ def most_share(axis: PlantSetSpec) -> float:
     """Return the largest share of compensation in the mixture for an axis; the rest is shaper."""
     if stated_hz(axis) is not None:
         return 0.0
-    return _UNSEEN_SHARE if _unseen(axis) else 1.0
-
-
-def _unseen(axis: PlantSetSpec) -> bool:
-    """Return whether the phase of an axis is unmeasured."""
-    about = axis.provenance
-    return about is None or about.magnitude_only or stated_hz(axis) is not None
+    return _UNSEEN_SHARE if phase_unseen(axis) else 1.0
 
 
 def _pair_weights(machine: Machine, count: int) -> Array:
@@ -476,8 +399,3 @@ def _pair_weights(machine: Machine, count: int) -> Array:
     )
     both = np.array([x[j % len(x)] * y[j % len(y)] for j in range(count)])
     return np.asarray(np.sqrt(both) / np.sqrt(both).sum())
-
-
-def _side_by_side(x: Sequence[DiscretePlant], y: Sequence[DiscretePlant]) -> list[Pair]:
-    """Return pairs of members; the shorter list repeats."""
-    return [(x[j % len(x)], y[j % len(y)]) for j in range(max(len(x), len(y)))]

@@ -26,11 +26,10 @@ from stillpath.pipeline.caution import (
     Mixtures,
     Shares,
     best_shares,
-    error_ranges,
     measured_set,
     most_share,
-    nominal_response,
 )
+from stillpath.pipeline.error_range import ErrorRange, error_ranges
 from stillpath.pipeline.files import kept
 from stillpath.pipeline.measuring.reference_shaper import BestShaper, cached_shaper
 from stillpath.pipeline.result import Channel
@@ -40,7 +39,7 @@ __all__ = ["LiveDesign", "cached_live_design", "design_live", "live_filter"]
 Array = NDArray[np.float64]
 
 DT_S = 1e-3
-_VERSION = 4
+_VERSION = 5
 """Part of the cache's name; rises when the design changes."""
 _CORNERS_HZ = (70.0, 90.0, 115.0, 150.0, 200.0, 270.0)
 _REACHES = (80, 160)
@@ -65,9 +64,8 @@ class LiveDesign:
     shaper : BestShaper
     worst, mean : float
         Largest and geometric mean over the members of the contour error against the shaper's.
-    contour_um : dict
-        By channel (before, live, shaper): nominal contour error rms on the reference motion, and
-        least and largest over the members.
+    ranges : dict of str to ErrorRange
+        By channel: before, live, shaper.
     peak_accel_mm_s2 : float
         Of an axis of the command on the reference motion.
     """
@@ -78,7 +76,7 @@ class LiveDesign:
     shaper: BestShaper
     worst: float
     mean: float
-    contour_um: dict[str, tuple[float, float, float]]
+    ranges: dict[str, ErrorRange]
     peak_accel_mm_s2: float
 
     def accel_gain(self, axis: int) -> float:
@@ -96,10 +94,8 @@ class LiveDesign:
         if not any(map(measured_set, machine.axes.values())):
             return channel
         name = "live" if channel.name == "after" else channel.name
-        usual_um, *ends_um = self.contour_um[name]
-        share = channel.extruding.contour_rms_um / max(usual_um, 1e-9)
-        low, high = (share * end_um for end_um in ends_um)
-        return channel.model_copy(update={"contour_range_um": (low, high)})
+        um = self.ranges[name].around_um(channel.extruding.contour_rms_um)
+        return channel.model_copy(update={"contour_range_um": um})
 
 
 def live_filter(machine: Machine, taps: Array) -> LiveFilter:
@@ -150,8 +146,8 @@ def _read(found: dict[str, Any]) -> LiveDesign:
     taps = np.array(found["taps"], dtype=float)
     if taps.shape not in {(2, 2 * reach + 1) for reach in _REACHES} or not np.isfinite(taps).all():
         raise ValueError("no taps of a filter")
-    contour_um = {name: tuple(values) for name, values in found["contour_um"].items()}
-    given = {"taps": taps, "shares": tuple(found["shares"]), "contour_um": contour_um}
+    ranges = {name: ErrorRange(**known) for name, known in found["ranges"].items()}
+    given = {"taps": taps, "shares": tuple(found["shares"]), "ranges": ranges}
     return LiveDesign(**{**found, **given, "shaper": BestShaper(**found["shaper"])})
 
 
@@ -197,7 +193,7 @@ class _Trial:
             self._shaper,
             float(ratio.max()),
             mixtures.mean(ratio),
-            self._figures(channels),
+            error_ranges(self._machine, channels, mixtures.rms_mm, DT_S),
             _peak(command),
         )
 
@@ -230,15 +226,6 @@ class _Trial:
     def _command(self, taps: Array) -> Array:
         live = live_filter(self._machine, taps)
         return live.command(np.pad(self._path, ((0, 0), (live.margin, live.margin)), mode="edge"))
-
-    def _figures(self, channels: dict[str, Array]) -> dict[str, tuple[float, float, float]]:
-        spread = error_ranges(self._machine, channels, self._mixtures.rms_mm, DT_S)
-        out = {}
-        for name, command in channels.items():
-            motion_mm = nominal_response(self._machine, command, DT_S)
-            usual = 1e3 * self._mixtures.rms_mm(motion_mm)
-            out[name] = (usual, usual * spread[name][0], usual * spread[name][1])
-        return out
 
 
 def _shortened(taps: Array) -> Array:

@@ -9,6 +9,7 @@ from typing import Any
 
 from stillpath.models.firmware import Klipper
 from stillpath.models.machine import Machine
+from stillpath.pipeline.error_range import ErrorRange
 from stillpath.pipeline.files import default_cache_dir, replacing
 from stillpath.pipeline.live_design import DT_S, LiveDesign, cached_live_design
 from stillpath.version import __version__
@@ -75,10 +76,7 @@ def export_document(machine: Machine, design: LiveDesign) -> dict[str, Any]:
         },
         "predictions": {
             "of": "contour error while extruding on the reference motion, um rms; predictions",
-            "channels": {
-                name: {"nominal": _um(nominal), "least": _um(least), "most": _um(most)}
-                for name, (nominal, least, most) in design.contour_um.items()
-            },
+            "channels": {name: _channel(known) for name, known in design.ranges.items()},
             "against_shaper": {"mean": _um(design.mean), "worst": _um(design.worst)},
             "shaper": design.shaper.label,
             "bandwidth_hz": design.corner_hz,
@@ -93,6 +91,11 @@ def export_digest(document: dict[str, Any]) -> str:
     rest = {name: value for name, value in document.items() if name != "digest"}
     text = json.dumps(rest, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _channel(known: ErrorRange) -> dict[str, float]:
+    least_um, most_um = known.around_um(known.reference_um)
+    return {"nominal": _um(known.reference_um), "least": _um(least_um), "most": _um(most_um)}
 
 
 def _um(value: float) -> float:

@@ -1,0 +1,168 @@
+"""Predict the range in which a contour error lies, over everything that explains a measurement.
+
+Plants of a set differ in what they do to a command; so do known friction and the delay of one axis
+against the other. What a measurement cannot show at all, dry friction in resonance tables, is added
+at the upper end.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillpath.models.friction import DryFriction
+from stillpath.models.machine import Machine
+from stillpath.models.plant_specs import PlantSetSpec
+from stillpath.models.plants import DiscretePlant, frequency_response, plant_set
+from stillpath.models.typed_in import stated_hz
+from stillpath.simulation.response import response
+
+__all__ = [
+    "ErrorRange",
+    "error_ranges",
+    "nominal_response",
+    "phase_unseen",
+    "side_by_side",
+    "unseen_friction_mm",
+]
+
+Array = NDArray[np.float64]
+Pair: TypeAlias = tuple[DiscretePlant, DiscretePlant]
+
+_FRICTION_UNSURE = 0.25
+"""Relative error of identified friction: typically 10 % on virtual printers, rarely 25 %."""
+_FRICTION_UNSEEN_MM_S2 = 1500.0
+"""Dry friction over moving mass that tables may hide: .4 N on .25 kg of rails, 1.5 N on a bed."""
+_STEPS_UNSURE = 0.2
+"""Relative spread over the members of the error caused by whole motor steps: a guess."""
+_LAG_UNSURE_S = 1.5e-4
+"""Unknown delay of X against Y: alignment sets both to 0, but viscous guides may delay one."""
+_SLOW_HZ = 3.0
+"""Well below all modes: there a plant follows its command but for the bend of its springs."""
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorRange:
+    """Contour errors with one command on the reference motion, over all that may be true.
+
+    Attributes
+    ----------
+    reference_um : float
+        Error of the nominal plants, rms.
+    low, high : float
+        Least and largest ratio of the members' error (delays included) to it.
+    friction_um : float
+        What friction that the measurement cannot show adds to the square at most.
+    """
+
+    reference_um: float
+    low: float
+    high: float
+    friction_um: float = 0.0
+
+    def around_um(
+        self, predicted_um: float, harder: float = 1.0, *, steps: bool = False
+    ) -> tuple[float, float]:
+        """Return the range around the prediction for a print.
+
+        The error of a command differs between members; what whole motor steps add to it hardly
+        does, and what friction adds depends on where a path turns and not on its speed.
+
+        Parameters
+        ----------
+        predicted_um : float
+            Contour error of the nominal plants on the print, rms.
+        harder : float
+            Ratio of the uncompensated error of the print to that on the reference motion.
+        steps : bool
+            Whether the prediction includes whole motor steps.
+        """
+        own_um = min(predicted_um, harder * self.reference_um) if steps else predicted_um
+        rounded_um = math.sqrt(predicted_um**2 - own_um**2)
+        return (
+            math.hypot(self.low * own_um, (1.0 - _STEPS_UNSURE) * rounded_um),
+            math.hypot(self.high * own_um, (1.0 + _STEPS_UNSURE) * rounded_um, self.friction_um),
+        )
+
+
+def unseen_friction_mm(axis: PlantSetSpec) -> float:
+    """Return how far friction that was not measured may hold an axis back; 0 if it was.
+
+    A friction force bends the springs of an axis as far as an acceleration that needs this force.
+    """
+    if axis.friction_mm is not None or not phase_unseen(axis):
+        return 0.0
+    slow = frequency_response(axis.without_delay().nominal, np.array([_SLOW_HZ]))
+    bend_s2 = abs(float(slow.real[0]) - 1.0) / (2.0 * np.pi * _SLOW_HZ) ** 2
+    return _FRICTION_UNSEEN_MM_S2 * bend_s2
+
+
+def nominal_response(machine: Machine, command: Array, dt_s: float) -> Array:
+    """Return the nominal plants' response to a command, dry friction included."""
+    pair = [plant_set(machine.axes[axis], dt_s).nominal for axis in ("x", "y")]
+    return response(pair, _received(machine, command))
+
+
+def error_ranges(
+    machine: Machine, commands: dict[str, Array], rms: Callable[[Array], float], dt_s: float
+) -> dict[str, ErrorRange]:
+    """Return the ranges of the errors of commands on the reference motion, by name.
+
+    Parameters
+    ----------
+    commands : dict of str to ndarray, shape (2, n)
+    rms : callable
+        Maps positions (2, n) to their rms error.
+    """
+    x, y = (plant_set(machine.axes[axis], dt_s) for axis in ("x", "y"))
+    pairs = side_by_side(x.members, y.members)
+    sides = np.where(np.arange(len(pairs)) % 2, 1.0, -1.0)
+    # Sets without measured phase already include delays.
+    lag_s = 0.0 if any(map(phase_unseen, machine.axes.values())) else _LAG_UNSURE_S
+    unseen_mm = [unseen_friction_mm(machine.axes[axis]) for axis in ("x", "y")]
+    out = {}
+    for name, command in commands.items():
+        nominal = max(rms(nominal_response(machine, command, dt_s)), 1e-12)
+        ratios = []
+        for pair, side in zip(pairs, sides, strict=True):
+            received = _received(machine, command, 1.0 + _FRICTION_UNSURE * side)
+            ratios.append(rms(_delayed(response(pair, received), side * lag_s / dt_s)) / nominal)
+        rubbed = nominal
+        if any(unseen_mm):
+            held = DryFriction(np.add(machine.friction_mm, unseen_mm).tolist())
+            rubbed = rms(response((x.nominal, y.nominal), held.received_mm(command)))
+        added = math.sqrt(max(0.0, rubbed**2 - nominal**2))
+        out[name] = ErrorRange(
+            1e3 * nominal, min(1.0, *ratios), max(1.0, *ratios), friction_um=1e3 * added
+        )
+    return out
+
+
+def _received(machine: Machine, command: Array, share: float = 1.0) -> Array:
+    """Return a command after dry friction; `share` scales the measured friction."""
+    return DryFriction([share * held for held in machine.friction_mm]).received_mm(command)
+
+
+def _delayed(y: Array, samples: float) -> Array:
+    """Return a motion (2, n) with X delayed by `samples`; if negative, Y is delayed instead."""
+    row = 0 if samples > 0.0 else 1
+    delayed = y.copy()
+    at = np.arange(y.shape[1], dtype=float)
+    delayed[row] = np.interp(at - abs(samples), at, y[row])
+    return delayed
+
+
+def phase_unseen(axis: PlantSetSpec) -> bool:
+    """Return whether the phase of an axis is unmeasured."""
+    about = axis.provenance
+    return about is None or about.magnitude_only or stated_hz(axis) is not None
+
+
+def side_by_side(x: Sequence[DiscretePlant], y: Sequence[DiscretePlant]) -> list[Pair]:
+    """Return pairs of members; the shorter list repeats."""
+    return [(x[j % len(x)], y[j % len(y)]) for j in range(max(len(x), len(y)))]
