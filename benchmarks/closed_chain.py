@@ -60,9 +60,8 @@ from stillpath.models.plants import PlantSetSpec, ZpkSpec, plant_set
 from stillpath.models.shaper_pulses import shaper_pulses
 from stillpath.models.store import load_machine
 from stillpath.models.typed_in import typed_in
-from stillpath.pipeline.caution import caution_for
 from stillpath.pipeline.compensate import compensate_file
-from stillpath.pipeline.measuring.reference_shaper import cached_shaper, tune_shaper
+from stillpath.pipeline.measuring.reference_shaper import tune_shaper
 from stillpath.pipeline.options import Options
 from stillpath.simulation.measures import PathDistances
 from stillpath.simulation.printers.bodies import Bodies
@@ -381,9 +380,8 @@ def compensated(
 ) -> tuple[Errors, tuple[float, float]]:
     """Errors of the written file on the printer, and the range that its report predicts."""
     with tempfile.TemporaryDirectory(prefix="stillpath-chain-") as folder:
-        cache, target = Path(folder), Path(folder) / "out.gcode"
-        result = compensate_file(file, target, machine, Options(), cache_dir=cache)
-        rubbed_um = unseen_friction_um(machine, cache)
+        target = Path(folder) / "out.gcode"
+        result = compensate_file(file, target, machine, Options(), cache_dir=Path(folder))
         written = read_motion(target, machine)
     original = read_motion(file, machine, forced_stops(own, written))
     parts = Aligned(original, written).sections(original, written)
@@ -391,14 +389,9 @@ def compensated(
     low_um, high_um = after.contour_range_um or 2 * (after.extruding.contour_rms_um,)
     # The report is about the whole file, the printer prints its beginning; friction is the same.
     part = nominal_um(parts, machine, seconds) / after.extruding.contour_rms_um
-    high_um = math.hypot(part * math.sqrt(high_um**2 - rubbed_um**2), rubbed_um)
+    rubbed_um = math.sqrt((after.contour_rubbing_um or high_um) ** 2 - high_um**2)
+    high_um = math.hypot(part * high_um, rubbed_um)
     return errors_of(parts, printer, seconds), (part * low_um, high_um)
-
-
-def unseen_friction_um(machine: Machine, cache: Path) -> float:
-    """Return what a report adds to the upper end for friction that the measurement cannot show."""
-    caution = caution_for(machine, Options(), cached_shaper(machine, cache), cache, DT_S)
-    return caution[1].ranges["after"].friction_um if caution else 0.0
 
 
 def nominal_um(parts: Sequence[Timed], machine: Machine, seconds: float) -> float:

@@ -103,6 +103,11 @@ def _error_table(result: Result) -> Table:
             "contour rms, all plants",
             *["{:.2f} - {:.2f}".format(*(c.contour_range_um or ())) for c in result.channels],
         )
+    if any(c.contour_rubbing_um for c in result.channels):
+        table.add_row(
+            "contour rms, if guides rub",
+            *[f"< {c.contour_rubbing_um or 0.0:.2f}" for c in result.channels],
+        )
     table.add_row("residual rms", *[f"{c.residual_rms_um:.2f}" for c in result.channels])
     return table
 

@@ -120,9 +120,7 @@ class Choice:
         updated = []
         for channel in channels:
             if channel.name in self.ranges:
-                known = self.ranges[channel.name]
-                um = known.around_um(channel.judged_rms_um, harder, steps=steps)
-                channel = channel.model_copy(update={"contour_range_um": um})
+                channel = self.ranges[channel.name].applied_to(channel, harder, steps=steps)
             updated.append(channel)
         return updated
 
@@ -204,10 +202,9 @@ def _friction_unseen(machine: Machine) -> str:
     if not held:
         return ""
     return (
-        " Resonance tables do not show dry friction. The upper ends of the ranges, those without "
-        f"compensation and with a shaper too, include guides that hold an axis back by {held}; "
-        "more is possible. Raw logs show friction, and then it is compensated "
-        "(docs/identification.md)."
+        " Resonance tables do not show dry friction. The figures for guides that rub assume 1.5 N "
+        f"per kg of moving mass, which holds an axis back by {held}; more is possible. Raw logs "
+        "show friction, and then it is compensated (docs/identification.md)."
     )
 
 

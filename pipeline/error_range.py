@@ -1,8 +1,7 @@
 """Predict the range in which a contour error lies, over everything that explains a measurement.
 
 Plants of a set differ in what they do to a command; so do known friction and the delay of one axis
-against the other. What a measurement cannot show at all, dry friction in resonance tables, is added
-at the upper end.
+against the other. Dry friction, which resonance tables cannot show at all, is told apart.
 """
 
 from __future__ import annotations
@@ -20,6 +19,7 @@ from stillpath.models.machine import Machine
 from stillpath.models.plant_specs import PlantSetSpec
 from stillpath.models.plants import DiscretePlant, frequency_response, plant_set
 from stillpath.models.typed_in import stated_hz
+from stillpath.pipeline.result import Channel
 from stillpath.simulation.response import response
 
 __all__ = [
@@ -68,10 +68,10 @@ class ErrorRange:
     def around_um(
         self, predicted_um: float, harder: float = 1.0, *, steps: bool = False
     ) -> tuple[float, float]:
-        """Return the range around the prediction for a print.
+        """Return the range around the prediction for a print, without unseen friction.
 
         The error of a command differs between members; what whole motor steps add to it hardly
-        does, and what friction adds depends on where a path turns and not on its speed.
+        does.
 
         Parameters
         ----------
@@ -86,8 +86,19 @@ class ErrorRange:
         rounded_um = math.sqrt(predicted_um**2 - own_um**2)
         return (
             math.hypot(self.low * own_um, (1.0 - _STEPS_UNSURE) * rounded_um),
-            math.hypot(self.high * own_um, (1.0 + _STEPS_UNSURE) * rounded_um, self.friction_um),
+            math.hypot(self.high * own_um, (1.0 + _STEPS_UNSURE) * rounded_um),
         )
+
+    def applied_to(self, channel: Channel, harder: float = 1.0, *, steps: bool = False) -> Channel:
+        """Return a channel with its range, and with how far friction may exceed it.
+
+        What friction adds depends on where a path turns and hardly on its speed: it is added as it
+        was found on the reference motion.
+        """
+        low_um, high_um = self.around_um(channel.judged_rms_um, harder, steps=steps)
+        rubbing_um = math.hypot(high_um, self.friction_um) if self.friction_um else None
+        ranges = {"contour_range_um": (low_um, high_um), "contour_rubbing_um": rubbing_um}
+        return channel.model_copy(update=ranges)
 
 
 def unseen_friction_mm(axis: PlantSetSpec) -> float:

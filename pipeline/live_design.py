@@ -94,8 +94,7 @@ class LiveDesign:
         if not any(map(measured_set, machine.axes.values())):
             return channel
         name = "live" if channel.name == "after" else channel.name
-        um = self.ranges[name].around_um(channel.extruding.contour_rms_um)
-        return channel.model_copy(update={"contour_range_um": um})
+        return self.ranges[name].applied_to(channel)
 
 
 def live_filter(machine: Machine, taps: Array) -> LiveFilter:

@@ -58,6 +58,9 @@ class Channel(_Figures):
     contour_range_um: tuple[float, float] | None = None
     """Least and largest contour error while extruding, root mean square, of all plants that explain
     the machine's measurement [um]; null for a machine without such a set."""
+    contour_rubbing_um: float | None = None
+    """Upper end of the range if guides rub with 1.5 N per kg of moving mass, which resonance tables
+    do not show [um]; null where friction was measured."""
     selected_rms_um: float | None = None
     """Contour error while extruding, root mean square, of the features that are compensated [um];
     null where all are. The range is theirs then."""

@@ -95,8 +95,10 @@ def headline_figures(channels: Sequence[Channel]) -> dict[str, Any]:
     before, after = rms.get("before"), rms.get("after")
     ratio = before / after if before and after else None
     ranges = {channel.name: channel.contour_range_um for channel in channels}
+    rubbing = {channel.name: channel.contour_rubbing_um for channel in channels}
     return {
         "range": ranges.get("after") if extrudes else None,
+        "rubbing": rubbing if extrudes and rubbing.get("after") else None,
         "shaper_range": ranges.get("shaper") if extrudes else None,
         "of": of if extrudes else "of all motion (nothing is extruded)",
         "before": before,

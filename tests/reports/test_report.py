@@ -39,7 +39,7 @@ def test_both_files_are_written_whole(result: Result, tmp_path: Path):
         "report.json",
     ]
     text = (tmp_path / "a" / "b" / "report.json").read_text().replace("null", '"nan"')
-    for name in ("contour_range_um", "selected_rms_um"):
+    for name in ("contour_range_um", "contour_rubbing_um", "selected_rms_um"):
         text = text.replace(f'"{name}":"nan"', f'"{name}":null')
     read = Result.model_validate(
         json.loads(text) | {"budget": None, "advice": None, "last_check": None}
@@ -64,6 +64,18 @@ def test_a_set_of_plants_says_a_range(result: Result):
     assert "20.0 to 41.0" in page
     assert "all plants that explain" in page
     assert "times smaller" not in page
+    assert "if guides rub" not in page
+
+
+def test_what_guides_that_rub_would_do_stands_beside_the_range(result: Result):
+    most = {"before": 191.2, "after": 27.4, "shaper": 45.6}
+    channels = [
+        c.model_copy(update={"contour_range_um": (4.21, 17.3), "contour_rubbing_um": most[c.name]})
+        for c in result.channels
+    ]
+    page = render_report(result.model_copy(update={"channels": channels}))
+    assert "up to 27.4 (191 as sliced)" in page
+    assert "up to 45.6 if guides rub" in page
 
 
 def test_nothing_is_fetched(page: str):
