@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fnmatch
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,10 +15,10 @@ __all__ = [
     "Group",
     "Item",
     "check_apart",
-    "is_print_file",
     "is_stamped",
     "items_of",
     "parse_map",
+    "print_files",
 ]
 
 _SUFFIXES = (".gcode", ".gco", ".g", ".nc", ".bgcode", ".bgc", ".3mf")
@@ -142,7 +143,7 @@ def check_apart(folder: Path, output: Path) -> None:
         )
 
 
-def is_print_file(path: Path) -> bool:
+def _is_print_file(path: Path) -> bool:
     """Return whether a file in a folder is to be done, by its name."""
     name = path.name.lower()
     return (
@@ -174,13 +175,21 @@ def _names(text: str) -> tuple[str, ...]:
     return tuple(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
 
 
-def _below(folder: Path, output: Path) -> Iterator[tuple[Path, str]]:
+def print_files(folder: Path, output: Path) -> Iterator[Path]:
+    """Yield print files below a folder in order, without hidden ones and those in `output`.
+
+    Folders may disappear meanwhile, such as those of a run that writes into `output`.
+    """
     kept_out = output.resolve()
-    for path in sorted(folder.rglob("*")):
-        inside = path.relative_to(folder)
-        if any(part.startswith(".") for part in inside.parts):
-            continue
-        if not is_print_file(path) or path.resolve().is_relative_to(kept_out):
-            continue
+    for parent, folders, names in os.walk(folder):
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        for name in sorted(names):
+            path = Path(parent, name)
+            if _is_print_file(path) and not path.resolve().is_relative_to(kept_out):
+                yield path
+
+
+def _below(folder: Path, output: Path) -> Iterator[tuple[Path, str]]:
+    for path in sorted(print_files(folder, output)):
         if not is_stamped(path):
-            yield path, inside.as_posix()
+            yield path, path.relative_to(folder).as_posix()

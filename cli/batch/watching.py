@@ -14,7 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from stillpath.cli.batch.items import Group, Item, is_print_file, is_stamped
+from stillpath.cli.batch.items import Group, Item, is_stamped, print_files
 from stillpath.cli.batch.output import Outcome, OutputFolder
 from stillpath.cli.batch.worker_pool import WorkerPool
 from stillpath.pipeline.files import replacing
@@ -116,14 +116,10 @@ class Watcher:
 
     def _present(self) -> dict[Path, _Signature]:
         found: dict[Path, _Signature] = {}
-        for path in self._folder.rglob("*"):
-            inside = path.relative_to(self._folder).parts
-            if any(part.startswith(".") for part in inside):
-                continue
+        for path in print_files(self._folder, self._kept_out):
             with suppress(OSError):  # it may be gone by now
-                if is_print_file(path) and not path.resolve().is_relative_to(self._kept_out):
-                    state = path.stat()
-                    found[path] = (state.st_size, state.st_mtime_ns, state.st_ino)
+                state = path.stat()
+                found[path] = (state.st_size, state.st_mtime_ns, state.st_ino)
         return found
 
     def _hand_over(self, path: Path, seen: _Seen, now: float) -> bool:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -17,7 +19,7 @@ import pytest
 
 from stillpath.applications.machines.resolve import Resolver
 from stillpath.applications.machines.store import MachineStore
-from stillpath.cli.batch.items import Group
+from stillpath.cli.batch.items import Group, print_files
 from stillpath.cli.batch.output import Outcome, OutputFolder
 from stillpath.cli.batch.watching import Watcher
 from stillpath.cli.batch.worker_pool import LocalPool, worker_pool
@@ -110,6 +112,27 @@ def test_own_output_and_stamped_files_are_left_alone(folder):
         assert len(watch.until_quiet()) == 1
         assert watch.until_quiet() == []
     assert [p.name for p in (folder / "done/ender3").iterdir()] == ["a.stillpath.gcode"]
+
+
+def test_folders_may_disappear_while_they_are_looked_through(folder):
+    """A run that wrote into a folder below the watched one once ended the watch."""
+    (folder / "a.gcode").write_text("G28")
+    done = threading.Event()
+
+    def come_and_go() -> None:
+        while not done.is_set():
+            deep = folder / "work" / "job" / "deeper"
+            deep.mkdir(parents=True)
+            shutil.rmtree(folder / "work")
+
+    thread = threading.Thread(target=come_and_go)
+    thread.start()
+    try:
+        for _ in range(2000):
+            assert [p.name for p in print_files(folder, folder / "done")] == ["a.gcode"]
+    finally:
+        done.set()
+        thread.join()
 
 
 def test_the_reason_stands_beside_the_file(folder):
