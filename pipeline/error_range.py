@@ -34,8 +34,9 @@ __all__ = [
 Array = NDArray[np.float64]
 Pair: TypeAlias = tuple[DiscretePlant, DiscretePlant]
 
-_FRICTION_UNSURE = 0.25
-"""Relative error of identified friction: typically 10 % on virtual printers, rarely 25 %."""
+_FRICTION_UNSURE = 0.35
+"""Relative error of identified friction: its size is typically 10 % off on virtual printers, rarely
+25 %, and how it builds up when the motion reverses is a guess."""
 _FRICTION_UNSEEN_MM_S2 = 1500.0
 """Dry friction over moving mass that tables may hide: .4 N on .25 kg of rails, 1.5 N on a bed."""
 _STEPS_UNSURE = 0.2

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from stillpath.compensation.base import DesignError
@@ -48,6 +48,7 @@ def test_error_depends_on_n_alone(name: str, n: int) -> None:
 
 @given(st.integers(1, 25), st.integers(0, 2**31))
 @settings(max_examples=30)
+@example(25, 1272295057)
 def test_no_basis_needs_less_effort_than_323(n: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     g = ToeplitzOperator(rng.normal(size=25) * 0.6 ** np.arange(25))
@@ -56,7 +57,9 @@ def test_no_basis_needs_less_effort_than_323(n: int, seed: int) -> None:
     random = np.linalg.qr(rng.normal(size=(25, n)))[0]
     design = FullPreview(g, random)
     if design.report.unique:
-        assert effort_metric(design.controller()) >= least * (1 - 1e-9)
+        # A random basis of all functions can be as bad for rounding as the plant itself.
+        rounding = 1e-9 + 4 * np.finfo(float).eps * np.linalg.cond(g.dense() @ random)
+        assert effort_metric(design.controller()) >= least * (1 - rounding)
     if sigma[n - 1] > 1e-5 * sigma[0]:
         best = FullPreview(g, ce_opt_basis(g.dense().T @ g.dense(), n)).controller()
         assert effort_metric(best) == pytest.approx(least, rel=1e-5)
