@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from stillpath.models.jit import kernel
 
-__all__ = ["advance_state", "advance_window", "run_windows"]
+__all__ = ["advance_state", "advance_window", "impulse_states", "run_windows"]
 
 _NOTHING = 1e-100
 
@@ -59,6 +59,25 @@ def advance_window(
     following = np.dot(drive, committed)
     following[:-2] += np.dot(advance, z[:-2])
     z[:] = following
+
+
+@kernel
+def impulse_states(
+    a: NDArray[np.float64], b: NDArray[np.float64], samples: int
+) -> NDArray[np.float64]:
+    """Return the state after an impulse of command, shape (order, samples), the latest last."""
+    order = len(b)
+    out = np.zeros((order, samples))
+    if samples > 0:
+        out[:, samples - 1] = b
+    for k in range(samples - 2, -1, -1):
+        for i in range(order):
+            total = 0.0
+            for j in range(order):
+                total += a[i, j] * out[j, k + 1]
+            # Flush decayed states to zero: denormal numbers are a hundred times slower.
+            out[i, k] = total if abs(total) > _NOTHING else 0.0
+    return out
 
 
 @kernel

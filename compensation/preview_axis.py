@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Set
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stillpath.compensation._preview_kernels import advance_state, advance_window
+from stillpath.compensation._preview_kernels import advance_state, advance_window, impulse_states
 from stillpath.compensation._window_kernels import Functions, Memory, Stepping, solve_windows
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.basis import BASES, ce_opt_basis, robust_basis
@@ -281,11 +281,18 @@ class PreviewAxis:
             return
         origin = float(command[-1])
         self._move_origin(origin)
-        recent = command[-self._memory :] - origin
-        states = self._states
-        if len(command) > self._memory:
-            states = self._resting(float(recent[0]))
-        self._states = self._advanced(states, recent)
+        if len(command) <= self._memory:
+            self._states = self._advanced(self._states, command - origin)
+            return
+        # All that came before is forgotten, as if the axis had stood where this begins.
+        recent = command[-self._memory :]
+        began = float(recent[0])
+        self._states = self._resting(began - origin) + self._remembered @ (recent - began)
+
+    @cached_property
+    def _remembered(self) -> Array:
+        """Effect of each recent sample on the states, shape (states, samples)."""
+        return np.concatenate([impulse_states(p.a, p.b, self._memory) for p in self._plants])
 
     def commit(self, command: AxisCommand) -> None:
         """Mark a command as executed."""

@@ -24,9 +24,9 @@ from stillpath.gcode.types import Phases
 from stillpath.models.machine import Machine
 from stillpath.models.operating import OperatingGrid, machine_at
 from stillpath.models.plants import plant_set
-from stillpath.models.runs import runs
 from stillpath.models.schedule import EMPTY, OperatingPoint
 from stillpath.pipeline.caution import design_mode, set_or_nominal
+from stillpath.pipeline.filament import feed_evenly, retract_along
 from stillpath.pipeline.following import follow_tolerance_mm, strayed
 from stillpath.pipeline.measuring._peak_kernels import peaks, speed_step
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
@@ -52,9 +52,6 @@ _ACCEL_SHARES = (1.0, 0.8, 0.6, 0.5)
 _SOFT_S = (2e-3, 4e-3, 8e-3)
 """Half-widths of the moving mean that rounds corners, tried in turn where they are too sharp."""
 
-_FEED_REACH, _FEED_REACH_MM = 2.5, 0.5
-"""Half-width of the smoothing of filament along the path: a multiple of the filament per mm of
-path, and the most in mm."""
 _ROUNDED = 1.0 + 1e-9
 
 
@@ -210,8 +207,8 @@ class PieceCompensator:
             wanted = _mean(path[:2], round(soft_s / DT_S))
             xy_mm = self.compensator.compensate(wanted, extruding, timeline.rests)
             command = np.concatenate([xy_mm, path[2:]])
-            _retract_along(command, timeline, phases)
-            _feed_evenly(command, extruding)
+            retract_along(command, timeline, phases)
+            feed_evenly(command, extruding)
             self._check_travel(command[:2], timeline.row, piece)
             self._check_motors(command[:2])
             step_mm, bend_mm = peaks(command)
@@ -355,52 +352,6 @@ def _mean(path_mm: NDArray[np.float64], reach: int) -> NDArray[np.float64]:
 
 def _error_filter(machine: Machine) -> ErrorFilter:
     return ErrorFilter([plant_set(machine.axes[a], DT_S).nominal for a in ("x", "y")])
-
-
-def _retract_along(command: NDArray[np.float64], timeline: Timeline, phases: Phases) -> None:
-    """Spread the filament that wipes pull back evenly over the command's path, in place.
-
-    Klipper limits such moves by E per mm of XY. The command may stand where the plan creeps, and
-    vice versa: filament at the plan's times would need impossible accelerations.
-    """
-    wipes = phases.moves_xy & (phases.direction[:, 3] < 0.0)
-    if not np.any(wipes):
-        return
-    inside = wipes[timeline.row] & timeline.moving
-    last = command.shape[1] - 1
-    for first, end in runs(inside):
-        # Use the plan's ends: samples around a wipe may lie in a retraction at rest.
-        row, stop = timeline.row[first], timeline.row[end - 1] + 1
-        begins = phases.start_mm[row, 3]
-        ends = phases.start_mm[stop, 3] if stop < len(phases) else command[3, last]
-        span = slice(max(first - 1, 0), min(end, last) + 1)
-        step = np.sqrt(np.sum(np.diff(command[:2, span]) ** 2, axis=0))
-        way = np.concatenate([[0.0], np.cumsum(step)])
-        if way[-1] > 0.0:
-            share = way[first - span.start : end - span.start] / way[-1]
-            command[3, first:end] = begins + (ends - begins) * share
-
-
-def _feed_evenly(command: NDArray[np.float64], extruding: NDArray[np.bool_]) -> None:
-    """Smooth the filament along the command's path within each printed run, in place.
-
-    In corners the command's speed differs from the plan's, which the filament follows: the filament
-    per mm of path is uneven there, and firmwares brake for it, more so on thick lines.
-    """
-    for first, end in runs(extruding):
-        span = slice(max(first - 1, 0), end)
-        fed_mm = command[3, span] - command[3, span.start]
-        way_mm = np.append(0.0, np.cumsum(np.hypot(*np.diff(command[:2, span]))))
-        if way_mm[-1] <= 0.0:
-            continue
-        # The mean narrows towards the ends of the run, so that the total is unchanged.
-        reach_mm = min(_FEED_REACH * fed_mm[-1] / way_mm[-1], _FEED_REACH_MM)
-        reach = np.minimum(np.minimum(way_mm, way_mm[-1] - way_mm), reach_mm)
-        area = np.append(0.0, np.cumsum(0.5 * (fed_mm[1:] + fed_mm[:-1]) * np.diff(way_mm)))
-        low, high = (np.interp(way_mm + side * reach, way_mm, area) for side in (-1.0, 1.0))
-        wide = reach > 1e-3
-        fed_mm[wide] = ((high - low)[wide]) / (2.0 * reach[wide])
-        command[3, span] = command[3, span.start] + fed_mm
 
 
 def deviation(piece: CompensatedPiece, executed: Phases) -> NDArray[np.float64]:

@@ -10,7 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import BSpline
 
-from stillpath.compensation._preview_kernels import advance_state, advance_window, run_windows
+from stillpath.compensation._preview_kernels import (
+    advance_state,
+    advance_window,
+    impulse_states,
+    run_windows,
+)
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.basis import BASES, bspline_basis, ce_opt_basis
 from stillpath.compensation.lifted import LiftedSet
@@ -265,6 +270,8 @@ def test_twin_of_advance_state(seed: int, order: int, samples: int) -> None:
         expected = a @ expected + b * value
     kept = x.copy()
     np.testing.assert_allclose(advance_state(a, b, x, u), expected, atol=1e-10)
+    from_rest = advance_state(a, b, np.zeros(order), u)
+    np.testing.assert_allclose(impulse_states(a, b, samples) @ u, from_rest, atol=1e-10)
     np.testing.assert_array_equal(x, kept)
 
 
