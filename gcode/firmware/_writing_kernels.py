@@ -27,7 +27,7 @@ def printed_feedrate(f: float) -> float:
 
 @kernel(force_inline=True, allocates=False)
 def _put_number(buffer: NDArray[np.uint8], at: int, millionths: int) -> int:
-    """Write ``millionths / 1e6`` without trailing zeros; returns the next free byte.
+    """Write ``millionths / 1e6`` without needless zeros (``.5``); returns the next free byte.
 
     Three digits at a time, with their count from the table, which avoids mispredicted branches. Up
     to two more bytes are overwritten.
@@ -38,7 +38,9 @@ def _put_number(buffer: NDArray[np.uint8], at: int, millionths: int) -> int:
         millionths = -millionths
     whole = millionths // 1_000_000
     fraction = millionths - 1_000_000 * whole
-    if whole < 1000:
+    if whole == 0 and fraction:
+        pass
+    elif whole < 1000:
         at = _put_three(buffer, at, _LEADING, whole)
     else:
         power = 1000
