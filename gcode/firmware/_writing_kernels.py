@@ -38,10 +38,9 @@ def _put_number(buffer: NDArray[np.uint8], at: int, millionths: int) -> int:
         millionths = -millionths
     whole = millionths // 1_000_000
     fraction = millionths - 1_000_000 * whole
-    if whole == 0 and fraction:
-        pass
-    elif whole < 1000:
-        at = _put_three(buffer, at, _LEADING, whole)
+    if whole < 1000:
+        if whole or not fraction:
+            at = _put_three(buffer, at, _LEADING, whole)
     else:
         power = 1000
         while whole // power >= 1000:
