@@ -19,9 +19,14 @@ _TRAILING = np.array(
 
 
 @kernel(inline=True)
-def printed_feedrate(f: float) -> float:
-    """F rounded to the decimals that `format_moves` prints: about six significant digits."""
+def printed_feedrate(f: float, whole_from: float = np.inf) -> float:
+    """F rounded to the decimals that `format_moves` prints: about six significant digits.
+
+    None from `whole_from` on, where a planner keeps time whatever F is rounded to.
+    """
     digits = 10.0 if f >= 100.0 else 1000.0 if f >= 1.0 else 1e5
+    if f >= whole_from:
+        digits = 1.0
     return max(float(np.round(f * digits)), 1.0) / digits
 
 

@@ -134,7 +134,7 @@ def test_what_is_left_out_has_the_firmwares_pressure_advance(
     for line in target.read_bytes().splitlines():
         if (match := re.match(rb"(?:M572 S|M900 K)([\d.]+)", line)) is not None:
             advance_s = float(match[1])
-        elif re.match(rb"G1 .*[XY].* E\d", line):
+        elif re.match(rb"G1 .*[XY].* E[.\d]", line):
             (of_file if b";#" in line else of_stream).add(advance_s)
     assert (of_stream, of_file) == ({0.0}, {0.05})
 

@@ -20,7 +20,9 @@ CATCH_UP = 0.1
 """Share of every segment's planned time by which a late stretch catches up."""
 _ROUNDS = 3
 _SETTLED_MM_S = 1e-4
-"""Convergence limit of speeds: F has steps of 1.7e-3 mm/s or more."""
+"""Convergence limit of speeds: F has larger steps."""
+_WHOLE_F = 300.0
+"""F from which no decimals are written: the next segment makes up for a duration 0.2 % off."""
 
 
 @kernel(allocates=False)
@@ -154,7 +156,7 @@ def assign_speeds(
                 v = np.sqrt(fastest2)
             if abs(v - last) < _SETTLED_MM_S:
                 break
-        feedrate[i] = printed_feedrate(60.0 * v)
+        feedrate[i] = printed_feedrate(60.0 * v, _WHOLE_F)
         v = feedrate[i] / 60.0
         corner = min(v, before, junction_mm_s[i])
         loss = min((v - corner) ** 2 / (twice_accel * v), MOST_LOST * available)
