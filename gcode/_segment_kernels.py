@@ -94,6 +94,7 @@ def fit_stretch(
     last: int,
     begin: NDArray[np.float64],
     level: bool,
+    ends: NDArray[np.bool_],
     answers: Answers,
     states: NDArray[np.complex128],
     errors: NDArray[np.float64],
@@ -107,7 +108,8 @@ def fit_stretch(
     the frame of the path's direction determines the length of a segment; its exact end, inside the
     (slightly wider) funnel, is chosen so that the machine's response to the error stays small.
     `states` (axes, order) is the state of that response and is updated in place. With `level` set,
-    z is the same at `begin` and at all samples. `errors` (LONGEST,) is scratch.
+    z is the same at `begin` and at all samples. A segment ends at every sample marked in `ends`.
+    `errors` (LONGEST,) is scratch.
     Vertices in X and Y lie on multiples of `grid`; they are written from row `begun` on. A segment
     is cut short where the speed of an axis would step too far, as far as one sample allows.
     Returns their number.
@@ -133,6 +135,7 @@ def fit_stretch(
             k,
             last,
             level,
+            ends,
         )
         span = end * dt_s - origin_s
         end_x, end_y = position[0, end], position[1, end]
@@ -191,6 +194,7 @@ def _reach(
     k: int,
     last: int,
     level: bool,
+    ends: NDArray[np.bool_],
 ) -> tuple[int, float, float, float, float, float, float]:
     """Find the last sample at which a segment that begins with sample `k` may end.
 
@@ -244,6 +248,8 @@ def _reach(
         left = max(left, (off - across - loose) * rate)
         right = min(right, (off + across + loose) * rate)
         end = j
+        if ends[j]:
+            break
     z_slope = 0.0 if level else 0.5 * (z_low + z_high)
     return end, wide_low, wide_high, left, right, z_slope, 0.5 * (e_low + e_high)
 

@@ -24,7 +24,7 @@ from stillpath.gcode.dialect import Action, Dialect
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.dialects import dialect_of
 from stillpath.gcode.firmware.registry import adapter
-from stillpath.gcode.lexer import Command, odd_numbers, split_line
+from stillpath.gcode.lexer import Command, check_line_ends, odd_numbers, split_line
 from stillpath.gcode.meta import META_WORDS, held_back, meta_command
 from stillpath.gcode.state import MachineState, nobody
 from stillpath.gcode.types import KEPT, EventKind, Events, Limits, ModalState, Moves, ProgramBlock
@@ -195,6 +195,7 @@ class Interpreter:
     def _read_lines(self, text: bytes) -> list[ProgramBlock]:
         state, i = self.state, self.state.i
         stop = len(text) - PADDING
+        check_line_ends(text, int(i[at.I_LINE]), self.dialect)
         self._text = text
         state.buffer = np.frombuffer(text, np.uint8)
         i[at.I_POS] = 0

@@ -18,13 +18,21 @@ from types import MappingProxyType
 from stillpath.gcode.dialect import Dialect
 from stillpath.gcode.errors import GcodeError
 
-__all__ = ["Command", "extended_parameters", "odd_numbers", "split_classic", "split_line"]
+__all__ = [
+    "Command",
+    "check_line_ends",
+    "extended_parameters",
+    "odd_numbers",
+    "split_classic",
+    "split_line",
+]
 
 _LETTERS = re.compile(r"([A-Z_]+|[A-Z*])")
 _LINE_NUMBER = re.compile(r"\s*[Nn]\s*-?\d+\s*")
 _NAME = re.compile(r"([A-Za-z]) *(-?\d+)(\.\d+)?")
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)")
 _EXPONENT = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?::[-+]?(?:\d+\.?\d*|\.\d+))*")
+_BEHIND_RETURN = re.compile(rb"\r[ \t]*[GMNT] *\d", re.IGNORECASE)
 _META = re.compile(
     r"(if|elif|else|while|break|continue|abort|var|global|set|echo|skip)(?=$|[\s{\"(])"
 )
@@ -53,6 +61,37 @@ class Command:
     text: str = ""
     dropped: str = ""
     uncertain: bool = False
+
+
+def check_line_ends(text: bytes, line: int, dialect: Dialect) -> None:
+    """Refuse a line that goes on with a command after a carriage return.
+
+    All firmwares but Klipper end a line there (Marlin queue.cpp, ISEOL; RepRapFirmware
+    StringParser.cpp, Put).
+
+    Parameters
+    ----------
+    text : bytes
+        Whole lines.
+    line : int
+        Number of the first.
+    dialect : Dialect
+
+    Raises
+    ------
+    GcodeError
+    """
+    if dialect.extended_commands:
+        return
+    for found in _BEHIND_RETURN.finditer(text):
+        begin = text.rfind(b"\n", 0, found.start()) + 1
+        if text[begin : found.start()].strip():
+            raise GcodeError(
+                f"the line goes on after a carriage return, where {dialect.title} ends it; save "
+                "the file with LF or CRLF line ends",
+                line=line + text.count(b"\n", 0, begin),
+                text=text[begin : found.end()].decode("utf-8", "replace"),
+            )
 
 
 def split_line(text: str, dialect: Dialect) -> list[Command]:

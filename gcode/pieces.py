@@ -10,7 +10,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
+import numpy as np
+from numpy.typing import NDArray
+
 from stillpath.gcode.types import (
+    EventKind,
     Events,
     Limits,
     ModalState,
@@ -69,6 +73,16 @@ class Piece(VerbatimPart):
     def planned(cls, lines: VerbatimPart, phases: Phases) -> Piece:
         """Return the lines of a verbatim part with the plan of its moves."""
         return cls(**{f.name: getattr(lines, f.name) for f in fields(lines)}, phases=phases)
+
+    @property
+    def marked_rows(self) -> NDArray[np.int64]:
+        """Rows of moves before which a fan, an output or a message is switched, in motion."""
+        events = self.events
+        inside = (events.kind == EventKind.HARMLESS) & (events.move_index < len(self.moves))
+        begins = events.byte_start[inside] - self.text_offset
+        letters = np.frombuffer(self.text, np.uint8)[begins] | 32
+        is_command = (letters >= ord("a")) & (letters <= ord("z"))
+        return np.asarray(events.move_index[inside][is_command])
 
 
 class LeftOut(VerbatimPart):

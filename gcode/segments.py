@@ -130,6 +130,7 @@ def fit_segments(
     *,
     step_mm_s: float = np.inf,
     grid_mm: float = 1e-3,
+    ends: NDArray[np.bool_] | None = None,
 ) -> Segments:
     """Fit the stretches of a piece.
 
@@ -147,6 +148,8 @@ def fit_segments(
         Segments are cut short where the speed of an axis would step by more.
     grid_mm : float
         X and Y of all vertices but the last of a stretch are multiples of this.
+    ends : ndarray of bool, shape (n,), optional
+        Samples at which a segment must end.
     """
     # A vertex on a coarse grid (whole motor steps) is up to half a grid step off.
     slack_mm = max(0.5 * (grid_mm - tolerance_mm), 0.0)
@@ -158,8 +161,9 @@ def fit_segments(
         e_mm=E_TOLERANCE_MM,
         step_mm_s=step_mm_s,
     )
-    fit = _Fit(timeline, command_mm, error_filter, bounds, grid_mm)
     samples = command_mm.shape[1]
+    ends = np.zeros(samples, np.bool_) if ends is None else ends
+    fit = _Fit(timeline, command_mm, error_filter, bounds, grid_mm, ends)
     for i, group in enumerate(timeline.groups):
         if group.rest:
             fit.rest(timeline.end_s[i] - timeline.start_s[i])
@@ -183,9 +187,10 @@ class _Fit:
         error_filter: ErrorFilter,
         bounds: Bounds,
         grid_mm: float,
+        ends: NDArray[np.bool_],
     ) -> None:
         self._timeline, self._command_mm, self._bounds = timeline, command_mm, bounds
-        self._filter, self._grid_mm = error_filter, grid_mm
+        self._filter, self._grid_mm, self._ends = error_filter, grid_mm, ends
         capacity = command_mm.shape[1] + len(timeline.groups)
         self._end_s, self._end_mm = np.empty(capacity), np.empty((4, capacity))
         self._groups = np.empty(capacity, dtype=np.int64)
@@ -220,6 +225,7 @@ class _Fit:
             last,
             begin,
             bool(np.all(command_mm[2, first : last + 1] == begin[2])),
+            self._ends,
             self._filter.answers,
             self._states,
             self._errors,

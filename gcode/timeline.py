@@ -72,6 +72,12 @@ class Timeline:
     group_start_mm: NDArray[np.float64]
     row_start_s: NDArray[np.float64]
 
+    def starts(self, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Mark the samples at which rows begin, shape (n,)."""
+        marks = np.zeros(len(self.row), np.bool_)
+        marks[np.rint(self.row_start_s[rows] / self.dt_s).astype(np.int64)] = True
+        return marks
+
 
 def group_rows(phases: Phases) -> list[Group]:
     """Split the rows of a piece into stretches and rests, in order."""

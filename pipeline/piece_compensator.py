@@ -244,6 +244,7 @@ class PieceCompensator:
                 self._filter,
                 step_mm_s=step_mm_s,
                 grid_mm=self.encoder.grid_mm,
+                ends=timeline.starts(piece.marked_rows),
             )
             self._keep_inside(segments)
             encoded = self.encoder.encode(piece, timeline, segments)

@@ -208,9 +208,9 @@ class StreamWriter:
     def _event_places(self, piece: Piece, encoded: Encoded) -> NDArray[np.int64]:
         """Return the index of the written move before which each event is written."""
         first = np.full(len(piece.moves) + 1, len(encoded.row), np.int64)
-        planned = encoded.row_start_s
-        place = np.searchsorted(encoded.start_s, planned - 1e-6)
-        first[:-1] = np.minimum(place, len(encoded.row))
+        # The move that begins nearest to the moment; the encoder's times are slightly off the plan.
+        between_s = 0.5 * (encoded.start_s[1:] + encoded.start_s[:-1])
+        first[:-1] = np.searchsorted(between_s, encoded.row_start_s - 1e-6)
         rest = encoded.row >= 0
         rows, places = encoded.row[rest], np.flatnonzero(rest)
         first[rows] = places

@@ -36,6 +36,8 @@ _MAY_MOVE = re.compile(
     rb"G[ \t]*-?0*[01235](?!\d)|[XYZEIJK][ \t]*[-+.\d]|.*[\s\d]G-?0*[01235](?!\d)"
 )
 _TEXT = (b"M117", b"M118", b"M23")
+_BARE_TEXT = (b"M117", b"M23")
+"""Those whose rest RepRapFirmware takes as text, if it has no quotes."""
 _AXES = b"XYZEF"
 _NO_WORDS = np.zeros(at.WORD_COUNT)
 _MOST_HARMLESS = 1 << 10
@@ -169,7 +171,8 @@ class Reader:
         return self._condition < 0
 
     def _harmless(self, code: bytes, name: bytes, rest: bytes) -> Kind:
-        if self.rules.several and name not in _TEXT and _FURTHER.search(rest):
+        is_text = name in _BARE_TEXT and not rest.lstrip().startswith(b'"')
+        if self.rules.several and not is_text and _FURTHER.search(rest):
             return self._forget(code, modes=True)
         if self.rules.stacks and name == b"G10" and rest.strip():
             return self._forget(code)  # offsets of a tool or a workspace

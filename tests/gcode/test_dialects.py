@@ -227,11 +227,21 @@ def test_where_it_ends(case: str, name: str, read) -> None:
         ("EXCLUDE_OBJECT_DEFINE NAME=" + "a" * 300, "reprapfirmware", "aborts the print"),
         ("G1 X10 F600\nG2 I-5 P1", "marlin-2.0", "divides by zero"),
         ("G2 I5 P101", "marlin", "100"),
+        ("G1 X5 F600\rG1 X9", "marlin", "line 1.* carriage return.*LF"),
+        ("G28\nM106 S9\r\nM106 S0\r M82", "marlin", "line 3.* carriage return"),
+        ("; fan\rM106 S9", "reprapfirmware", "carriage return"),
     ],
 )
 def test_refused(line: str, name: str, words: str, read) -> None:
     with pytest.raises(GcodeError, match=words):
         read(line + "\n", name)
+
+
+@pytest.mark.parametrize("line", ["G1 X5 F600\r\r", "\rG1 X5 F600", "G1 X5 F600 ; a\rb"])
+def test_carriage_returns_that_end_no_command(line: str, read) -> None:
+    for name in ("klipper", "marlin", "reprapfirmware"):
+        block, _ = read(line + "\n", name)
+        assert len(block.moves) == 1
 
 
 def test_r_one_per_cent_too_short(read) -> None:

@@ -255,6 +255,13 @@ def test_macros_that_the_machine_declares(wary_machine: Machine) -> None:
     ]
 
 
+def test_a_printer_without_macros_still_has_klippers_own_commands(golden_machine: Machine) -> None:
+    firmware = golden_machine.firmware.model_copy(update={"unknown_commands": "skip"})
+    machine = golden_machine.model_copy(update={"firmware": firmware})
+    block = run("START_PRINT\nPAUSE\nM25\nSET_TMC_CURRENT STEPPER=stepper_x CURRENT=1\n", machine)
+    assert kinds(block) == [EventKind.HARMLESS, *[EventKind.UNKNOWN] * 3]
+
+
 def test_firmware_retraction(golden_machine: Machine) -> None:
     block = run("G28\nG1 X5 E1 F6000\nG10\nG10\nG1 X6\nG11\nG1 X7 E2\n", golden_machine)
     assert block.moves.end_mm[:, 3] == pytest.approx([1, 0.2, 0.2, 1, 2])

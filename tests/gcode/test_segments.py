@@ -104,6 +104,17 @@ def test_bounds(seed: int, samples: int, tolerance_um: float, speed: float, shap
     assert np.max(np.abs(error[3])) <= module.E_TOLERANCE_MM * 1.01
 
 
+def test_segments_end_at_marked_samples() -> None:
+    command = np.zeros((4, 401))
+    command[0] = np.linspace(0.0, 20.0, 401)
+    ends = np.zeros(401, np.bool_)
+    ends[[7, 150, 151, 300]] = True
+    error_filter = ErrorFilter([SILENT, SILENT])
+    segments = fit_segments(line_of(command), command, 2e-3, error_filter, ends=ends)
+    assert {7, 150, 151, 300} <= set(np.rint(segments.end_s / DT_S).tolist())
+    assert len(segments) <= len(fit(command, 2e-3)) + 4
+
+
 @settings(max_examples=30)
 @given(seed=st.integers(0, 10**6), samples=st.integers(60, 400), shaped=st.booleans())
 def test_ends_grid_and_order(seed: int, samples: int, shaped: bool) -> None:

@@ -58,6 +58,25 @@ def test_compensated(kind: str, tmp_path: Path, cache: Path) -> None:
     assert result.filament_error_mm < 1e-2
 
 
+@pytest.mark.parametrize("kind", ["klipper", *KINDS])
+def test_a_fan_is_switched_where_the_file_says(kind: str, tmp_path: Path, cache: Path) -> None:
+    """A straight line at one speed would be a single segment."""
+    machine = load_machine("ender3") if kind == "klipper" else machine_with(kind)
+    fans = [(x, f"G1 X{x} E.2\nM106 S{x}\n") for x in range(55, 150, 5)]
+    text = "G28\nG90\nM83\nG1 X50 Y50 Z1 F6000\nG1 X50 Y60 F3000\n"
+    text += "".join(line for _, line in fans) + "G1 X200 E1\nG1 Y80 E1\n"
+    result, written = compensated(text, tmp_path, cache, machine)
+    assert result.put_back == []
+    x_mm, seen = 0.0, {}
+    for line in written.decode().splitlines():
+        if line.startswith("M106"):
+            seen[int(line.removeprefix("M106 S"))] = x_mm
+        elif found := re.match(r"G1 .*?X([\d.]+)", line):
+            x_mm = float(found[1])
+    assert list(seen) == [x for x, _ in fans]
+    assert list(seen.values()) == pytest.approx(list(seen), abs=0.3)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_move_of_less_than_a_step_alone(kind: str, tmp_path: Path, cache: Path) -> None:
     """Seen by fuzzing: of a wipe that the motors round away nothing is left but its filament."""

@@ -368,7 +368,18 @@ G1 X1.928 Y2.298
 {global.x}
 G1
 G1 X-0.261 Y2.989
-G1 X-0.521 Y2.954\rG1 X-0.776 Y2.898
+G1 X-0.521 Y2.954 G1 X-0.776 Y2.898
+"""
+NO_TEXT = """\
+M83
+G1 X100 Y100 F3000
+G1 X110 Y100 E.5
+M118 P0 said G1 X105
+G1 X110 Y100 E.5
+G1 X110 Y110 E.5
+M117 "said" G1 X105
+G1 X110 Y110 E.5
+G1 X110 Y100 E.5
 """
 ODD_SHAPER = """\
 GM593 P"none"
@@ -490,6 +501,8 @@ LAYER_AGAIN = (
         pytest.param("reprapfirmware", SLOW_FLOW, id="slow flow"),
         # Repeated as the file's own line for the shaper.
         pytest.param("reprapfirmware", ODD_SHAPER, id="odd shaper"),
+        # What follows a text moves too.
+        pytest.param("reprapfirmware", NO_TEXT, id="no text"),
         # Lines of the file with the text of ours, after others of which nobody knows.
         pytest.param("klipper", OUR_OWN_F, id="our own F"),
         pytest.param("klipper", OUR_OWN_LIMITS, id="our own limits"),
