@@ -75,7 +75,8 @@ class Timeline:
     def starts(self, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Mark the samples at which rows begin, shape (n,)."""
         marks = np.zeros(len(self.row), np.bool_)
-        marks[np.rint(self.row_start_s[rows] / self.dt_s).astype(np.int64)] = True
+        at = np.rint(self.row_start_s[rows] / self.dt_s).astype(np.int64)
+        marks[np.minimum(at, len(marks) - 1)] = True
         return marks
 
 
