@@ -53,7 +53,7 @@ def file_rewriting(
     layers: Path | None,
     progress: ProgressCallback | None,
 ) -> Iterator[FileRewriting]:
-    """Open the files of a rewrite; target and layers are put in place at the end.
+    """Open the files of a rewrite; layers and target are put in place at the end.
 
     Raises
     ------
@@ -65,12 +65,10 @@ def file_rewriting(
     began = source.stat()
     unpacking = progress_to(progress, "unpacking", 0.0)
     packing = progress_to(progress, "packing", 1.0)
-    with (
-        contextlib.ExitStack() as files,
-        replacing(target) as temporary,
-        open_text(source, plate=plate, folder=target.parent, progress=unpacking) as container,
-    ):
+    with replacing(target) as temporary:
         with (
+            contextlib.ExitStack() as files,  # a disk may have no room for the layers
+            open_text(source, plate=plate, folder=target.parent, progress=unpacking) as container,
             rewriting(container, temporary, name=target, progress=packing) as text,
             tempfile.TemporaryFile(dir=target.parent) as spool,
         ):

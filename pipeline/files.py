@@ -127,31 +127,26 @@ def _link(handle: int, target: Path) -> Path:
 
 
 def kept(path: Path, read: Callable[[Any], T], make: Callable[[], T]) -> T:
-    """Return the content of a JSON file; if missing or unreadable, make and write it.
+    """Return the content of a JSON file; one that is missing or unreadable is made anew.
 
     Parameters
     ----------
     path : Path
-        Written whole or not at all; its folder is made if it does not exist.
+        Written whole or, where the folder or disk refuses it, not at all.
     read : callable
         Turns the JSON document into the value; raises ValueError, TypeError or KeyError if it
         cannot.
     make : callable
         Makes the value, a dataclass of numbers, strings and arrays.
-
-    Raises
-    ------
-    OSError
-        The file cannot be written.
     """
-    with contextlib.suppress(OSError, ValueError, TypeError, KeyError):
+    with contextlib.suppress(OSError, ValueError, TypeError, KeyError, AttributeError):
         return read(json.loads(path.read_text(encoding="utf-8")))
     made = make()
-    document: Any = asdict(made)  # type: ignore[call-overload]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as temporary:
-        text = json.dumps(document, default=lambda array: array.tolist())
-        temporary.write_text(text, encoding="utf-8")
+    text = json.dumps(asdict(made), default=lambda array: array.tolist())  # type: ignore[call-overload]
+    with contextlib.suppress(OSError):  # no room, no right: it is made again next time
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(path) as temporary:
+            temporary.write_text(text, encoding="utf-8")
     return made
 
 
