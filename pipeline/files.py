@@ -14,7 +14,15 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeVar
 
-__all__ = ["Discarding", "default_cache_dir", "kept", "replacing", "result_name", "sync"]
+__all__ = [
+    "Discarding",
+    "check_unchanged",
+    "default_cache_dir",
+    "kept",
+    "replacing",
+    "result_name",
+    "sync",
+]
 
 T = TypeVar("T")
 
@@ -60,12 +68,31 @@ def replacing(target: Path) -> Iterator[Path]:
     except BaseException as error:
         with contextlib.suppress(OSError):  # an unnamed file cannot and need not be removed
             temporary.unlink(missing_ok=True)
-        if isinstance(error, OSError) and error.filename is None:
-            error.filename = str(target)  # errors of a full disk carry no name
+        if isinstance(error, OSError) and (error.filename is None or error.filename2 is not None):
+            # Of a full disk no name, of copying and renaming that of the temporary file or source.
+            error.filename = str(target)
         raise
     finally:
         if handle is not None:
             os.close(handle)
+
+
+def check_unchanged(source: Path, began: os.stat_result) -> None:
+    """Refuse to mix what was read with what is there now, or to replace what nobody read.
+
+    Raises
+    ------
+    OSError
+        EBUSY if the file is not as it was when its state `began` was taken.
+    """
+    now = source.stat()
+    if (now.st_size, now.st_mtime_ns) != (began.st_size, began.st_mtime_ns):
+        raise OSError(
+            errno.EBUSY,
+            "another program changed the file while it was processed, so nothing was written; "
+            "run it again",
+            str(source),
+        )
 
 
 def sync(path: Path) -> None:

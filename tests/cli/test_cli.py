@@ -315,6 +315,14 @@ def test_a_full_disk_is_told_with_its_place(pipeline, source, tmp_path, capsys):
     assert [path.name for path in tmp_path.iterdir()] == ["part.gcode"]
 
 
+def test_a_full_disk_is_not_blamed_on_the_source_of_a_copy(tmp_path):
+    """As `shutil` does it, which names what it reads first."""
+    target = tmp_path / "copy.gcode"
+    with pytest.raises(OSError, match="No space left") as caught, replacing(target):
+        raise OSError(errno.ENOSPC, "No space left on device", "part.gcode", None, "/proc/7/fd/3")
+    assert caught.value.filename == str(target)
+
+
 def test_a_console_that_knows_only_ascii_gets_what_it_can_show():
     """A result would break at the micro sign, after its file was written."""
     code = (
