@@ -161,6 +161,19 @@ def test_a_full_disk_does_not_end_the_watch(folder, monkeypatch):
         assert [o.state for o in watch.until_quiet()] == ["failed"]
 
 
+def test_a_name_too_long_for_a_result_is_told_once(folder):
+    """It was compensated again and again."""
+    (folder / f"{249 * 'l'}.gcode").write_text("G28")
+    with watching(folder) as watch:
+        (outcome,) = watch.until_quiet()
+        assert (outcome.state, outcome.trouble) == ("failed", "file")
+        assert "rename the file" in outcome.error
+        tries = PretendedWorker.tries
+        watch.look(1000)
+        assert watch.until_quiet() == []
+        assert PretendedWorker.tries == tries
+
+
 def test_the_reason_stands_beside_the_file(folder):
     reason = folder / "a.gcode.error.txt"
     with watching(folder) as watch:
