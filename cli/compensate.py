@@ -78,7 +78,10 @@ def compensate(
             source, target, found.machine, options, progress=progress, layers=report
         )
     result.warnings.extend(found.warnings)
-    _write_report(result, report)
+    try:
+        _write_report(result, report)
+    except OSError as error:  # the file is in its place, and right
+        result.warnings.append(f"no report: {error.filename}: {error.strerror}")
     print_result(result)
 
 

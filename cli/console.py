@@ -42,7 +42,8 @@ def progress_shown() -> Iterator[Callable[[Progress], None]]:
 
 def print_result(result: Result) -> None:
     """Print what was measured: one column per channel, then time, size and warnings."""
-    console = Console(highlight=False)
+    # Names are no markup: part[bold].gcode, :x:.gcode.
+    console = Console(highlight=False, markup=False, emoji=False)
     console.print(_error_table(result))
     console.print(f"best shaper for this machine: {result.best_shaper}")
     if result.confirmation:
@@ -61,11 +62,11 @@ def print_result(result: Result) -> None:
         if result.budget is not None:
             console.print(budget_line(result.budget))
         if result.advice is not None:
-            console.print(_advice_line(result.advice), markup=False)
+            console.print(_advice_line(result.advice))
     for way in result.ways:
         console.print(_way_line(way))
     if result.not_live:
-        console.print(f"not live: {result.not_live}", markup=False)
+        console.print(f"not live: {result.not_live}")
     if result.pieces:
         console.print(
             f"reverted to the sliced lines: {len(result.put_back)} of {result.pieces} pieces "
@@ -77,7 +78,7 @@ def print_result(result: Result) -> None:
             f"{result.slicer or 'the slicer'} says {result.slicer_time_s:.0f} s for the sliced file"
         )
     for warning in result.warnings:
-        console.print(f"warning: {warning}", markup=False)
+        console.print(f"warning: {warning}")
 
 
 def _error_table(result: Result) -> Table:

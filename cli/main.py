@@ -8,9 +8,12 @@ file, and the input as it was.
 from __future__ import annotations
 
 import errno
+import os
 import sys
+from contextlib import suppress
 from io import TextIOWrapper
-from typing import Annotated, NoReturn
+from pathlib import Path
+from typing import Annotated, NoReturn, TextIO
 
 import typer
 
@@ -56,11 +59,43 @@ _WITH_WORKERS = (["serve"], ["scheduler"], ["worker"])
 
 def main() -> NoReturn:
     """Run the command line and exit; the entry point of the `stillpath` command."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):  # a console may know no micro sign and no frames
-            stream.reconfigure(errors="replace")
+    sys.stdout, sys.stderr = _Out.over(sys.stdout), _Errors.over(sys.stderr)
     prepare_environment(computing=sys.argv[1:2] not in _WITH_WORKERS)
     sys.exit(run(sys.argv[1:]))
+
+
+class _Out(TextIOWrapper):
+    """Standard output: what is done counts, also if nobody reads the figures to their end."""
+
+    _unheard: type[OSError] = BrokenPipeError
+
+    @classmethod
+    def over(cls, stream: TextIO | None) -> TextIO:
+        """Return a stream in place of Python's, which is None where it was closed."""
+        if stream is None:
+            return Path(os.devnull).open("w", encoding="utf-8")
+        if not isinstance(stream, TextIOWrapper):
+            return stream
+        encoding, lines, at_once = stream.encoding, stream.line_buffering, stream.write_through
+        # A console may know no micro sign and no frames.
+        return cls(stream.detach(), encoding, "replace", None, lines, at_once)
+
+    def write(self, text: str) -> int:
+        """See `io.TextIOWrapper`."""
+        with suppress(self._unheard):
+            return super().write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        """See `io.TextIOWrapper`."""
+        with suppress(self._unheard):
+            super().flush()
+
+
+class _Errors(_Out):
+    """Standard error: a full disk or a terminal that went away does not end the work either."""
+
+    _unheard = OSError
 
 
 def run(arguments: list[str]) -> int:
@@ -88,6 +123,11 @@ def run(arguments: list[str]) -> int:
         if not _is_ours(error):
             raise
         return _fail(str(error), 2)
+    except RuntimeError as error:
+        remedy = next((_OF_PATHS[said] for said in _OF_PATHS if str(error).startswith(said)), None)
+        if remedy is None:
+            raise
+        return _fail(f"{error}; {remedy}", 1)
     except Exception as error:  # of a service that was asked: it knows how bad it is
         if not hasattr(error, "exit_code"):
             raise
@@ -145,6 +185,13 @@ _REMEDIES = {
     errno.EROFS: "nothing can be written there: take another folder",
     errno.EACCES: "this user may not use it: take another one, or have it allowed",
 }
+
+
+_OF_PATHS = {
+    "Symlink loop": "name a path that leads somewhere",
+    "Could not determine home directory": "set HOME to a folder of this user",
+}
+"""What `pathlib` raises as a RuntimeError, and remedies."""
 
 
 def _of_system(error: OSError) -> str:

@@ -58,18 +58,22 @@ def compensate_on_server(
     ------
     service.client.ClientError
     OSError
-        If the file or the report cannot be written.
+        If the file or the report cannot be written, or the source was changed meanwhile.
     """
+    from stillpath.pipeline.files import check_unchanged
     from stillpath.service.interruption import interruptible_at_once
 
     with interruptible_at_once(), _client(server, key) as client:
         with _progress() as tell:
+            began = source.stat()
             made = client.submit(source, machine=machine, options=options, tell=tell)
             job = client.result_of(made, tell=_reports(tell))
             if report is not None:
                 client.save_report(job.id, report)
+            figures = client.report(job.id)
+            check_unchanged(source, began)  # the target may be the source
             client.fetch(job, target, tell=tell)
-        _print_figures(client.report(job.id))
+        _print_figures(figures)
 
 
 @app.command("list")

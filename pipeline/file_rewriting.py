@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import errno
-import os
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -12,7 +10,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from stillpath.gcode.containers.opening import Container, open_text, rewriting
-from stillpath.pipeline.files import replacing
+from stillpath.pipeline.files import check_unchanged, replacing
 from stillpath.pipeline.measuring.layer_files import LayerWriter, written_layers
 from stillpath.pipeline.measuring.measure import CHANNELS
 from stillpath.pipeline.progress import ProgressCallback, progress_to
@@ -53,7 +51,7 @@ def file_rewriting(
     layers: Path | None,
     progress: ProgressCallback | None,
 ) -> Iterator[FileRewriting]:
-    """Open the files of a rewrite; target and layers are put in place at the end.
+    """Open the files of a rewrite; layers and target are put in place at the end.
 
     Raises
     ------
@@ -65,12 +63,10 @@ def file_rewriting(
     began = source.stat()
     unpacking = progress_to(progress, "unpacking", 0.0)
     packing = progress_to(progress, "packing", 1.0)
-    with (
-        contextlib.ExitStack() as files,
-        replacing(target) as temporary,
-        open_text(source, plate=plate, folder=target.parent, progress=unpacking) as container,
-    ):
+    with replacing(target) as temporary:
         with (
+            contextlib.ExitStack() as files,  # a disk may have no room for the layers
+            open_text(source, plate=plate, folder=target.parent, progress=unpacking) as container,
             rewriting(container, temporary, name=target, progress=packing) as text,
             tempfile.TemporaryFile(dir=target.parent) as spool,
         ):
@@ -80,18 +76,6 @@ def file_rewriting(
             made = FileRewriting(container, text, spool, writer)
             yield made
         # Before the target is put in place: it may be the source.
-        _check_unchanged(source, began)
+        check_unchanged(source, began)
         made.sizes["original_bytes"] = began.st_size
         made.sizes["written_bytes"] = temporary.stat().st_size
-
-
-def _check_unchanged(source: Path, began: os.stat_result) -> None:
-    """Refuse to mix what was read with what is there now, or to replace what nobody read."""
-    now = source.stat()
-    if (now.st_size, now.st_mtime_ns) != (began.st_size, began.st_mtime_ns):
-        raise OSError(
-            errno.EBUSY,
-            "another program changed the file while it was processed, so nothing was written; "
-            "run it again",
-            str(source),
-        )

@@ -14,7 +14,15 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeVar
 
-__all__ = ["Discarding", "default_cache_dir", "kept", "replacing", "result_name", "sync"]
+__all__ = [
+    "Discarding",
+    "check_unchanged",
+    "default_cache_dir",
+    "kept",
+    "replacing",
+    "result_name",
+    "sync",
+]
 
 T = TypeVar("T")
 
@@ -60,12 +68,31 @@ def replacing(target: Path) -> Iterator[Path]:
     except BaseException as error:
         with contextlib.suppress(OSError):  # an unnamed file cannot and need not be removed
             temporary.unlink(missing_ok=True)
-        if isinstance(error, OSError) and error.filename is None:
-            error.filename = str(target)  # errors of a full disk carry no name
+        if isinstance(error, OSError) and (error.filename is None or error.filename2 is not None):
+            # Of a full disk no name, of copying and renaming that of the temporary file or source.
+            error.filename = str(target)
         raise
     finally:
         if handle is not None:
             os.close(handle)
+
+
+def check_unchanged(source: Path, began: os.stat_result) -> None:
+    """Refuse to mix what was read with what is there now, or to replace what nobody read.
+
+    Raises
+    ------
+    OSError
+        EBUSY if the file is not as it was when its state `began` was taken.
+    """
+    now = source.stat()
+    if (now.st_size, now.st_mtime_ns) != (began.st_size, began.st_mtime_ns):
+        raise OSError(
+            errno.EBUSY,
+            "another program changed the file while it was processed, so nothing was written; "
+            "run it again",
+            str(source),
+        )
 
 
 def sync(path: Path) -> None:
@@ -127,31 +154,26 @@ def _link(handle: int, target: Path) -> Path:
 
 
 def kept(path: Path, read: Callable[[Any], T], make: Callable[[], T]) -> T:
-    """Return the content of a JSON file; if missing or unreadable, make and write it.
+    """Return the content of a JSON file; one that is missing or unreadable is made anew.
 
     Parameters
     ----------
     path : Path
-        Written whole or not at all; its folder is made if it does not exist.
+        Written whole or, where the folder or disk refuses it, not at all.
     read : callable
         Turns the JSON document into the value; raises ValueError, TypeError or KeyError if it
         cannot.
     make : callable
         Makes the value, a dataclass of numbers, strings and arrays.
-
-    Raises
-    ------
-    OSError
-        The file cannot be written.
     """
-    with contextlib.suppress(OSError, ValueError, TypeError, KeyError):
+    with contextlib.suppress(OSError, ValueError, TypeError, KeyError, AttributeError):
         return read(json.loads(path.read_text(encoding="utf-8")))
     made = make()
-    document: Any = asdict(made)  # type: ignore[call-overload]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as temporary:
-        text = json.dumps(document, default=lambda array: array.tolist())
-        temporary.write_text(text, encoding="utf-8")
+    text = json.dumps(asdict(made), default=lambda array: array.tolist())  # type: ignore[call-overload]
+    with contextlib.suppress(OSError):  # no room, no right: it is made again next time
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(path) as temporary:
+            temporary.write_text(text, encoding="utf-8")
     return made
 
 

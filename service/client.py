@@ -318,7 +318,7 @@ class Client:
     def _json(self, answer: httpx2.Response) -> Any:
         try:
             return json.loads(answer.content)
-        except ValueError:
+        except (ValueError, RecursionError):
             raise self._connection.stranger() from None
 
 

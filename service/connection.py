@@ -104,13 +104,20 @@ class Connection:
         if key:
             headers["Authorization"] = f"Bearer {key}"
         # A key must not follow a redirection to somewhere else, and no proxy leads to ourselves.
-        self._http = httpx2.Client(
-            base_url=self.server,
-            headers=headers,
-            timeout=_ANSWER_S,
-            follow_redirects=False,
-            trust_env=host not in ("localhost", "127.0.0.1", "::1"),
-        )
+        try:
+            self._http = httpx2.Client(
+                base_url=self.server,
+                headers=headers,
+                timeout=_ANSWER_S,
+                follow_redirects=False,
+                trust_env=host not in ("localhost", "127.0.0.1", "::1"),
+            )
+        except (httpx2.InvalidURL, ValueError, ImportError, OSError) as error:
+            raise ClientError(
+                f"{server} cannot be asked: {error}; look at the address, and at HTTP_PROXY, "
+                "HTTPS_PROXY, ALL_PROXY, NO_PROXY and SSL_CERT_FILE in the environment",
+                400,
+            ) from None
 
     def close(self) -> None:
         """Close the connections."""
@@ -222,7 +229,7 @@ class Connection:
             return
         try:
             problem = json.loads(answer.content)
-        except ValueError:
+        except (ValueError, RecursionError):
             problem = {}
         problem = problem if isinstance(problem, dict) else {}
         reason = problem.get("detail") or f"{self.server} answers {status} {answer.reason_phrase}"

@@ -65,9 +65,9 @@ def _package_is_writable() -> bool:
 
 def _kernel_cache() -> Path:
     base = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA")
-    folder = (Path(base) if base else Path.home() / ".cache") / "stillpath" / "numba"
     try:
+        folder = (Path(base) if base else Path.home() / ".cache") / "stillpath" / "numba"
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
+    except (OSError, RuntimeError):  # not allowed, or a user without a home
         return Path(tempfile.mkdtemp(prefix="stillpath-numba-"))
     return folder

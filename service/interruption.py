@@ -1,4 +1,4 @@
-"""Turn Ctrl-C and SIGTERM into an exception that is neither lost nor harmful.
+"""Turn Ctrl-C, SIGTERM and SIGHUP into an exception that is neither lost nor harmful.
 
 What a signal handler raises vanishes, or leaves half-made objects, when the signal arrives inside a
 callback from C or a compiler. The first signal is therefore only recorded, and raised at the next
@@ -25,7 +25,7 @@ class Interrupted(BaseException):
 
 @contextmanager
 def interruptible() -> Iterator[Callable[[], None]]:
-    """Turn SIGINT and SIGTERM into `Interrupted`; yield a check to call now and then."""
+    """Turn SIGINT, SIGTERM and SIGHUP into `Interrupted`; yield a check to call now and then."""
     received: list[int] = []
 
     def check() -> None:
@@ -36,12 +36,8 @@ def interruptible() -> Iterator[Callable[[], None]]:
         check()
         received.append(number)
 
-    before = {number: signal.signal(number, remember) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
+    with _handled_by(remember):
         yield check
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 @contextmanager
@@ -51,9 +47,21 @@ def interruptible_at_once() -> Iterator[None]:
     def stop(number: int, _: FrameType | None) -> None:
         raise Interrupted(number)
 
-    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    with _handled_by(stop):
+        yield
+
+
+@contextmanager
+def _handled_by(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
+    """Handle what asks for the end, as far as it is not ignored, as `nohup` has it."""
+    asking = [getattr(signal, name, None) for name in ("SIGINT", "SIGTERM", "SIGHUP")]
+    before = {
+        number: signal.signal(number, handler)
+        for number in asking
+        if number is not None and signal.getsignal(number) != signal.SIG_IGN
+    }
     try:
         yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        for number, former in before.items():
+            signal.signal(number, former)

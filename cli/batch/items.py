@@ -150,7 +150,7 @@ def _is_print_file(path: Path) -> bool:
         name.endswith(_SUFFIXES)
         and not name.startswith(".")
         and ".stillpath." not in name
-        and path.is_file()
+        and os.path.isfile(path)  # noqa: PTH113 - raises nothing in folders that may not be entered
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import multiprocessing
 import os
 import signal
@@ -151,6 +152,8 @@ def failure_of(error: Exception) -> Failure:
             return Failure("out of memory; take fewer --jobs", "computer")
         case OSError():
             place = f"{error.filename}: " if error.filename else ""
+            if error.errno == errno.ENAMETOOLONG:
+                return Failure(f"{place}{error.strerror}; rename the file", "file")
             return Failure(f"{place}{error.strerror or error}", "computer")
         case _:
             return Failure(f"an error of the program: {type(error).__name__}: {error}", "computer")

@@ -162,7 +162,7 @@ class OutputFolder:
             outcome = _read(folder / _RECORD)
             if outcome is not None:
                 self._place(folder, outcome)
-            else:
+            elif folder.is_dir():  # or what a file manager leaves everywhere
                 shutil.rmtree(folder)
 
     def _place(self, folder: Path, outcome: Outcome) -> None:

@@ -148,7 +148,8 @@ class Watcher:
                 work.next_at = now + _AGAIN_S[min(work.tries, len(_AGAIN_S) - 1)]
                 work.tries += 1
             elif outcome.state == "failed" and is_same:
-                self._output.note(outcome.output, outcome)
+                with suppress(OSError):  # a full disk: the next start tries the file again
+                    self._output.note(outcome.output, outcome)
             if work.error and work.error != seen.reported and is_same:
                 self._tell(outcome)
         if came and is_same:

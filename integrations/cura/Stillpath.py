@@ -444,8 +444,7 @@ class Service:
         machine = quote(options["machine"], safe="")
         # Whether address, key and machine are right is known before a long upload.
         self._ask("GET", f"/v1/machines/{machine}", min(self._FIRST_PATIENCE_S, self._timeout_s))
-        job = self._send(source, options)
-        path = f"/v1/jobs/{job}"
+        path = f"/v1/jobs/{quote(self._send(source, options), safe='')}"
         try:
             self._fetch(path, self._wait(path, wait_s), target)
             return self._ask("GET", f"{path}/report", self._timeout_s)
@@ -458,9 +457,9 @@ class Service:
         job, _ = self._upload(source, options, uuid.uuid4().hex)
         size = source.stat().st_size
         if job.get("source_bytes") != size:
-            self._forget(f"/v1/jobs/{job.get('id')}")
+            self._forget(f"/v1/jobs/{quote(job['id'], safe='')}")
             raise Failure(f"sent {size} bytes, but {job.get('source_bytes')} arrived", 1)
-        return str(job["id"])
+        return job["id"]
 
     def _upload(
         self, source: Path, options: Mapping[str, Any], key: str, patience_s: float = 0.0
@@ -493,8 +492,8 @@ class Service:
                 return job
             if state in ("failed", "cancelled"):
                 problem = job.get("error") or {}
-                reason = problem.get("detail", f"the job was {state} on the server")
-                raise Failure(reason, 2 if problem.get("status", 422) < 500 else 1)
+                reason = problem.get("detail") or f"the job was {state} on the server"
+                raise Failure(reason, 1 if str(problem.get("status")).startswith("5") else 2)
             if wait_s is not None and time.monotonic() - began > wait_s:
                 raise Failure(f"not done within {wait_s:.0f} s; given up", 1)
             waiting = job.get("queue_position")
@@ -505,7 +504,7 @@ class Service:
 
     def _fetch(self, path: str, job: Mapping[str, Any], target: Path) -> None:
         """Write the result of a job to a file, all of it and nothing else."""
-        expected = int(job.get("result_bytes") or 0)
+        expected = job.get("result_bytes") or 0
 
         def save(answer: Any) -> bytes:
             read = 0
@@ -518,7 +517,11 @@ class Service:
                 raise _Broken(f"{read} of {expected} bytes came")
             return b""
 
-        self._ask("GET", f"{path}/result", self._timeout_s, take=save)
+        try:
+            self._ask("GET", f"{path}/result", self._timeout_s, take=save)
+        except OSError as error:  # of a full disk, which does not say where
+            error.filename = str(target)
+            raise
 
     def _forget(self, path: str) -> None:
         """Delete the job, unless it is gone, or the server: nobody wants it any more."""
@@ -583,8 +586,10 @@ class Service:
             raise _Broken(str(getattr(error, "reason", "") or error), midway) from None
 
     def _document(self, answer: bytes) -> dict[str, Any]:
+        """Return what a server says of a job; what is used of it must be of its kind."""
         document = _object(answer)
-        if not document:
+        said = {name: kind for name, kind in _JOB.items() if document.get(name) is not None}
+        if "id" not in said or not all(isinstance(document[n], said[n]) for n in said):
             raise Failure(f"{self._address} answers, but not as a Stillpath server", 1)
         return document
 
@@ -600,6 +605,19 @@ class Service:
         elif error.code == 404 and "/v1/jobs/" in error.url:
             reason = f"the job was cancelled on the server: {reason}"
         return Failure(reason, 2 if error.code < 500 else 1)
+
+
+_JOB: dict[str, Any] = {
+    "id": str,
+    "state": str,
+    "stage": str,
+    "error": dict,
+    "progress": (int, float),
+    "source_bytes": int,
+    "result_bytes": int,
+    "queue_position": int,
+}
+"""What is used of a job, and its kinds."""
 
 
 class _Broken(Exception):
@@ -629,7 +647,7 @@ def _read(answer: Any, size: int | None = None) -> bytes:
 
 def _object(answer: bytes) -> dict[str, Any]:
     """Return a JSON object, empty for anything else."""
-    with contextlib.suppress(ValueError):
+    with contextlib.suppress(ValueError, RecursionError):
         if isinstance(found := json.loads(answer), dict):
             return found
     return {}

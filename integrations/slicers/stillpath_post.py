@@ -107,10 +107,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _process(settings: Settings, voice: Voice, signals: Signals) -> None:
     """Compensate the file in place and put the report where it belongs."""
     began = time.monotonic()
-    # A link is followed, so that what it points to is replaced and not the link.
-    path = settings.file.resolve()
+    path = settings.file.absolute()
     if not path.is_file():
         raise Failure(f"{path} is a folder" if path.is_dir() else f"there is no file {path}")
+    # A link is followed, so that what it points to is replaced and not the link.
+    path = path.resolve()
     if not path.stat().st_size:
         raise Failure(f"{path} is empty")
     job = PrintJob(settings.file, settings.printer)
@@ -210,9 +211,11 @@ def replacing(target: Path) -> Iterator[Path]:
         with contextlib.suppress(OSError):  # file systems of memory cards know no modes
             temporary.chmod(stat.S_IMODE(target.stat().st_mode) if target.exists() else 0o644)
         temporary.replace(target)
-    except BaseException:
+    except BaseException as error:
         with contextlib.suppress(OSError):
             temporary.unlink()
+        if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+            error.filename = str(target)  # copying names the file that it reads
         raise
 
 
@@ -376,12 +379,18 @@ def default_settings_path(environment: Mapping[str, str] = os.environ) -> Path:
 
 
 def _user_dir(windows: str, xdg: str, fallback: str) -> Path:
-    home = Path("~").expanduser()
     if sys.platform == "win32":
-        return Path(os.environ.get(windows) or home / "AppData" / "Local")
+        return Path(os.environ.get(windows) or _home() / "AppData" / "Local")
     if sys.platform == "darwin":
-        return home / "Library" / "Application Support"
-    return Path(os.environ.get(xdg) or home / fallback)
+        return _home() / "Library" / "Application Support"
+    return Path(os.environ.get(xdg) or _home() / fallback)
+
+
+def _home() -> Path:
+    home = Path(os.path.expanduser("~"))  # noqa: PTH111 - as in `_path`
+    if not home.is_absolute():
+        raise Failure("this user has no home folder; set HOME to one")
+    return home
 
 
 def _set_up(settings: Settings, voice: Voice) -> None:
@@ -580,8 +589,7 @@ class Service:
         machine = quote(options["machine"], safe="")
         # Whether address, key and machine are right is known before a long upload.
         self._ask("GET", f"/v1/machines/{machine}", min(self._FIRST_PATIENCE_S, self._timeout_s))
-        job = self._send(source, options)
-        path = f"/v1/jobs/{job}"
+        path = f"/v1/jobs/{quote(self._send(source, options), safe='')}"
         try:
             self._fetch(path, self._wait(path, wait_s), target)
             return self._ask("GET", f"{path}/report", self._timeout_s)
@@ -594,9 +602,9 @@ class Service:
         job, _ = self._upload(source, options, uuid.uuid4().hex)
         size = source.stat().st_size
         if job.get("source_bytes") != size:
-            self._forget(f"/v1/jobs/{job.get('id')}")
+            self._forget(f"/v1/jobs/{quote(job['id'], safe='')}")
             raise Failure(f"sent {size} bytes, but {job.get('source_bytes')} arrived", 1)
-        return str(job["id"])
+        return job["id"]
 
     def _upload(
         self, source: Path, options: Mapping[str, Any], key: str, patience_s: float = 0.0
@@ -629,8 +637,8 @@ class Service:
                 return job
             if state in ("failed", "cancelled"):
                 problem = job.get("error") or {}
-                reason = problem.get("detail", f"the job was {state} on the server")
-                raise Failure(reason, 2 if problem.get("status", 422) < 500 else 1)
+                reason = problem.get("detail") or f"the job was {state} on the server"
+                raise Failure(reason, 1 if str(problem.get("status")).startswith("5") else 2)
             if wait_s is not None and time.monotonic() - began > wait_s:
                 raise Failure(f"not done within {wait_s:.0f} s; given up", 1)
             waiting = job.get("queue_position")
@@ -641,7 +649,7 @@ class Service:
 
     def _fetch(self, path: str, job: Mapping[str, Any], target: Path) -> None:
         """Write the result of a job to a file, all of it and nothing else."""
-        expected = int(job.get("result_bytes") or 0)
+        expected = job.get("result_bytes") or 0
 
         def save(answer: Any) -> bytes:
             read = 0
@@ -654,7 +662,11 @@ class Service:
                 raise _Broken(f"{read} of {expected} bytes came")
             return b""
 
-        self._ask("GET", f"{path}/result", self._timeout_s, take=save)
+        try:
+            self._ask("GET", f"{path}/result", self._timeout_s, take=save)
+        except OSError as error:  # of a full disk, which does not say where
+            error.filename = str(target)
+            raise
 
     def _forget(self, path: str) -> None:
         """Delete the job, unless it is gone, or the server: nobody wants it any more."""
@@ -719,8 +731,10 @@ class Service:
             raise _Broken(str(getattr(error, "reason", "") or error), midway) from None
 
     def _document(self, answer: bytes) -> dict[str, Any]:
+        """Return what a server says of a job; what is used of it must be of its kind."""
         document = _object(answer)
-        if not document:
+        said = {name: kind for name, kind in _JOB.items() if document.get(name) is not None}
+        if "id" not in said or not all(isinstance(document[n], said[n]) for n in said):
             raise Failure(f"{self._address} answers, but not as a Stillpath server", 1)
         return document
 
@@ -736,6 +750,19 @@ class Service:
         elif error.code == 404 and "/v1/jobs/" in error.url:
             reason = f"the job was cancelled on the server: {reason}"
         return Failure(reason, 2 if error.code < 500 else 1)
+
+
+_JOB: dict[str, Any] = {
+    "id": str,
+    "state": str,
+    "stage": str,
+    "error": dict,
+    "progress": (int, float),
+    "source_bytes": int,
+    "result_bytes": int,
+    "queue_position": int,
+}
+"""What is used of a job, and its kinds."""
 
 
 class _Broken(Exception):
@@ -765,7 +792,7 @@ def _read(answer: Any, size: int | None = None) -> bytes:
 
 def _object(answer: bytes) -> dict[str, Any]:
     """Return a JSON object, empty for anything else."""
-    with contextlib.suppress(ValueError):
+    with contextlib.suppress(ValueError, RecursionError):
         if isinstance(found := json.loads(answer), dict):
             return found
     return {}
@@ -851,7 +878,7 @@ def _parser() -> _Parser:
     add("--log", metavar="FILE", help="append what happens to this file")
     add("--timeout", metavar="S", type=float, help="patience with a silent server [60]")
     add("--wait", metavar="S", type=float, help="give a job on a server up after this time")
-    add("--config", metavar="FILE", help=f"settings [{default_settings_path()}]".replace("%", "%%"))
+    add("--config", metavar="FILE", help="settings [yours: --setup says where they are]")
     add("--setup", action="store_true", help="make the settings; show the line for the slicer")
     return parser
 
@@ -871,7 +898,8 @@ def _seconds(name: str, *given: float | None) -> float | None:
 
 
 def _path(text: str | None) -> Path | None:
-    return Path(text).expanduser() if text else None
+    # `Path.expanduser` raises where there is no such user, before anybody would hear of it.
+    return Path(os.path.expanduser(text)) if text else None  # noqa: PTH111
 
 
 def _first_line(path: Path) -> str:

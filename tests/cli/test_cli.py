@@ -315,6 +315,14 @@ def test_a_full_disk_is_told_with_its_place(pipeline, source, tmp_path, capsys):
     assert [path.name for path in tmp_path.iterdir()] == ["part.gcode"]
 
 
+def test_a_full_disk_is_not_blamed_on_the_source_of_a_copy(tmp_path):
+    """As `shutil` does it, which names what it reads first."""
+    target = tmp_path / "copy.gcode"
+    with pytest.raises(OSError, match="No space left") as caught, replacing(target):
+        raise OSError(errno.ENOSPC, "No space left on device", "part.gcode", None, "/proc/7/fd/3")
+    assert caught.value.filename == str(target)
+
+
 def test_a_console_that_knows_only_ascii_gets_what_it_can_show():
     """A result would break at the micro sign, after its file was written."""
     code = (
@@ -326,3 +334,62 @@ def test_a_console_that_knows_only_ascii_gets_what_it_can_show():
         [sys.executable, "-c", code], capture_output=True, text=True, check=False, env=ascii_only
     )
     assert (ran.returncode, ran.stdout, ran.stderr) == (3, "0.92 ?m ?\n", "")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="closes streams as a POSIX shell does")
+@pytest.mark.parametrize("closed", ["| true", ">&-", "2>&-", "2>/dev/full"])
+def test_what_is_done_counts_though_nobody_listens(closed: str):
+    """The file is in its place before figures are printed."""
+    program = (
+        "import sys; from stillpath.cli import main as cli\n"
+        "cli.run = lambda _: print('x' * 100_000) or sys.stderr.write('done\\n') and 0\n"
+        "cli.main()"
+    )
+    shell = ["bash", "-c", f'set -o pipefail; "$0" -c "$1" {closed}', sys.executable, program]
+    ran = subprocess.run(shell, stderr=subprocess.PIPE, text=True, check=False)
+    assert ran.returncode == 0
+    assert ran.stderr == ("" if closed.startswith("2") else "done\n")
+
+
+def test_names_are_shown_as_they_are(pipeline, source, tmp_path, capsys, monkeypatch):
+    name = "part[bold]:x:[/red].gcode"
+    made = make_result(layers=2).model_copy(update={"source_name": name})
+    monkeypatch.setattr(
+        sys.modules["stillpath.pipeline.compensate"], "compensate_file", lambda *_, **__: made
+    )
+    assert compensate(source, "-o", str(tmp_path / "out.gcode"), "-m", "ender3") == 0
+    assert name in capsys.readouterr().out
+
+
+def test_a_report_that_cannot_be_written_is_a_warning(pipeline, source, tmp_path, capsys):
+    """The file is in its place by then: an error would say that nothing was written."""
+    folder = tmp_path / "report"
+    pipeline.behave = lambda: (folder / "report.json").mkdir(parents=True)
+    assert compensate(source, "--in-place", "-m", "ender3", "--report", str(folder)) == 0
+    assert "warning: no report: " in capsys.readouterr().out
+    assert source.read_bytes().startswith(b"; compensated")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="makes symbolic links")
+def test_links_in_a_circle(pipeline, source, tmp_path, capsys):
+    link = tmp_path / "link"
+    link.symlink_to(link)
+    for command in (
+        ["compensate", str(source), "-m", "ender3", "-o", str(link)],
+        ["machines", "export", "ender3", "-o", str(link)],
+        ["batch", str(source), "-m", "ender3", "-o", str(link)],
+    ):
+        assert run(command) in (1, 2)
+        assert str(link) in one_line(capsys)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="homes of POSIX users")
+def test_a_user_without_a_home(pipeline, source, tmp_path, capsys, monkeypatch):
+    def homeless(_: int) -> None:
+        raise KeyError
+
+    for name in ("HOME", "XDG_DATA_HOME", "STILLPATH_DATA_DIR"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr("pwd.getpwuid", homeless)
+    assert compensate(source, "-o", str(tmp_path / "o"), "-m", "ender3") == 1
+    assert "set HOME" in one_line(capsys)

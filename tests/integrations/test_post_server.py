@@ -171,6 +171,27 @@ def test_a_server_that_is_something_else(part: Path, tmp_path: Path):
     assert_untouched(part)
 
 
+@pytest.mark.parametrize(
+    "job",
+    [
+        '{"source_bytes": 1}',
+        '{"id": "7", "source_bytes": SIZE, "error": "boom"}',
+        '{"id": "7", "source_bytes": SIZE, "state": "done", "result_bytes": 1e999}',
+        '{"id": "7", "source_bytes": SIZE, "state": "running", "progress": "half"}',
+        100_000 * "[",
+    ],
+)
+def test_a_server_that_talks_nonsense(part: Path, tmp_path: Path, monkeypatch, capsys, job: str):
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    answer = job.replace("SIZE", str(part.stat().st_size)).encode()
+    monkeypatch.setattr(stillpath_post.Service, "_ask", lambda *_, **__: answer)
+    monkeypatch.setattr(stillpath_post.Service, "_forget", lambda *_: None)
+    assert stillpath_post.main(["--server", "http://nas", "--machine", "ender3", str(part)]) == 1
+    said = capsys.readouterr().err
+    assert said == "stillpath-post: http://nas answers, but not as a Stillpath server\n"
+    assert_untouched(part)
+
+
 def test_a_job_that_is_cancelled_on_the_server(running: Running, part: Path, tmp_path: Path):
     part.write_bytes(b"slow\n")
     posting = start(*running.arguments, part, home=tmp_path)
@@ -233,6 +254,7 @@ def test_a_full_disk(running: Running, part: Path, tmp_path: Path):
     limited = ["sh", "-c", 'ulimit -f 1; exec "$@"', "sh", sys.executable, str(PROGRAM)]
     done = post(*running.arguments, part, home=tmp_path, command=limited)
     assert_reason(done, 1, "large")
+    assert "result: File too large" in done.stderr  # where
     assert_untouched(part, content)
 
 

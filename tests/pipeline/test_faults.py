@@ -68,3 +68,23 @@ def test_moves_below_the_grid_of_a_file(name: str, tmp_path: Path, cache: Path) 
     result, written = compensated(data, tmp_path, cache, name)
     assert all("internal error" not in piece.reason for piece in result.put_back)
     check_file(data, written, load_machine(name))
+
+
+def test_a_report_that_has_no_place_leaves_the_file(tmp_path: Path, cache: Path) -> None:
+    source, report = tmp_path / "part.gcode", tmp_path / "report"
+    source.write_text(HEAD + SQUARE)
+
+    def in_the_way(_: Progress) -> None:
+        (report / "layers.json").mkdir(parents=True, exist_ok=True)
+
+    with pytest.raises(OSError, match="layers"):
+        compensate_file(
+            source,
+            source,
+            load_machine("ender3"),
+            Options(),
+            cache_dir=cache,
+            progress=in_the_way,
+            layers=report,
+        )
+    assert source.read_text() == HEAD + SQUARE

@@ -106,6 +106,9 @@ def test_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         assert cached_shaper(machine, folder) == first
     assert len(calls) == 6
     assert json.loads(file.read_text())["fx_hz"] == 40.0
+    # Where nothing can be written, it is tuned each time.
+    assert cached_shaper(machine, file) == first
+    assert len(calls) == 7
 
 
 @pytest.mark.parametrize("name", builtin_machines())

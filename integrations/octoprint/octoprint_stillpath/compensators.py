@@ -182,7 +182,7 @@ class OnServer(Service):
         key = f"{self._entry.id}-{self._entry.tries}"
         options = {"machine": self._entry.machine, **self._entry.options, "name": name}
         job, is_new = self._upload(source, options, key, self._timeout_s)
-        self._note(job=str(job["id"]), is_ours=is_new)
+        self._note(job=job["id"], is_ours=is_new)
         if job.get("source_bytes") != source.stat().st_size:
             self.cancel()
             raise Failure(f"{job.get('source_bytes')} bytes arrived, not all of the file", 1)

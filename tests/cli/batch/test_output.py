@@ -73,6 +73,14 @@ def test_one_at_a_time(tmp_path):
         pass
 
 
+def test_what_file_managers_leave_is_no_obstacle(tmp_path):
+    with OutputFolder.opened(tmp_path) as output:
+        done(output)
+    (tmp_path / ".stillpath" / "work" / ".DS_Store").write_bytes(b"x")
+    with OutputFolder.opened(tmp_path) as output:
+        done(output, "; the next one\n")
+
+
 @pytest.mark.parametrize("step", range(12))
 def test_killed_at_any_step(step, tmp_path, monkeypatch):
     left = step

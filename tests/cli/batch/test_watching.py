@@ -135,6 +135,45 @@ def test_folders_may_disappear_while_they_are_looked_through(folder):
         thread.join()
 
 
+def test_folders_that_may_not_be_entered_are_passed_over(folder, monkeypatch):
+    for name in ("a", "shut"):
+        (folder / name).mkdir()
+        (folder / name / "part.gcode").write_text("G28")
+    really = os.stat
+
+    def denied(path, **named):
+        if Path(path) == folder / "shut" / "part.gcode":
+            raise PermissionError(13, "Permission denied", str(path))
+        return really(path, **named)
+
+    monkeypatch.setattr(os, "stat", denied)
+    found = print_files(folder, folder / "done")
+    assert [p.relative_to(folder).as_posix() for p in found] == ["a/part.gcode"]
+
+
+def test_a_full_disk_does_not_end_the_watch(folder, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(OutputFolder, "note", full)
+    with watching(folder) as watch:
+        (folder / "a.gcode").write_text("bad")
+        assert [o.state for o in watch.until_quiet()] == ["failed"]
+
+
+def test_a_name_too_long_for_a_result_is_told_once(folder):
+    """It was compensated again and again."""
+    (folder / f"{249 * 'l'}.gcode").write_text("G28")
+    with watching(folder) as watch:
+        (outcome,) = watch.until_quiet()
+        assert (outcome.state, outcome.trouble) == ("failed", "file")
+        assert "rename the file" in outcome.error
+        tries = PretendedWorker.tries
+        watch.look(1000)
+        assert watch.until_quiet() == []
+        assert PretendedWorker.tries == tries
+
+
 def test_the_reason_stands_beside_the_file(folder):
     reason = folder / "a.gcode.error.txt"
     with watching(folder) as watch:

@@ -18,6 +18,7 @@ from typing import Any
 
 import pytest
 
+from stillpath.cli import main
 from stillpath.service.api.schemas import JobView
 from stillpath.service.client import Client, ClientError
 from tests.integrations.breaking import BODY, TAKES_S, breaking_server
@@ -357,6 +358,36 @@ def test_compensate_with_a_server(address: str, tmp_path: Path):
     assert target.read_text() == "; compensated\nG1 X31\n"
     done = run("jobs", "list", "--server", "nas")
     assert (done.returncode, "http://127" in done.stderr) == (2, True)
+
+
+def test_a_file_that_somebody_changes_while_a_server_works(
+    address: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    """Sliced again meanwhile: the new one must not be replaced by what became of the old one."""
+    source = part(tmp_path, "G1 X32\n")
+    really = Client.result_of
+
+    def result_of(*arguments: Any, **named: Any) -> Any:
+        job = really(*arguments, **named)
+        source.write_text("G1 X1 ; sliced again\n")
+        return job
+
+    monkeypatch.setattr(Client, "result_of", result_of)
+    command = ["compensate", str(source), "--in-place", "-m", "ender3", "--server", address]
+    assert main.run(command) == 1
+    assert "another program changed the file" in capsys.readouterr().err
+    assert source.read_text() == "G1 X1 ; sliced again\n"
+
+
+@pytest.mark.parametrize("proxy", ["http:foo", "foo://nas", "socks5://nas:1", "http://[::1"])
+def test_proxies_that_are_none_are_named(proxy: str, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("ALL_PROXY", proxy)
+    with pytest.raises(ClientError, match="ALL_PROXY") as caught:
+        Client("http://nas")
+    assert caught.value.exit_code == 2
 
 
 @pytest.mark.slow
