@@ -123,15 +123,13 @@ def run(arguments: list[str]) -> int:
         if not _is_ours(error):
             raise
         return _fail(str(error), 2)
-    except RuntimeError as error:
+    except Exception as error:
+        if hasattr(error, "exit_code"):  # of a service that was asked: it knows how bad it is
+            return _fail(str(error), error.exit_code)
         remedy = next((_OF_PATHS[said] for said in _OF_PATHS if str(error).startswith(said)), None)
         if remedy is None:
             raise
         return _fail(f"{error}; {remedy}", 1)
-    except Exception as error:  # of a service that was asked: it knows how bad it is
-        if not hasattr(error, "exit_code"):
-            raise
-        return _fail(str(error), error.exit_code)
 
 
 @app.callback(invoke_without_command=True)
