@@ -282,7 +282,8 @@ def test_killed_again_and_again(tmp_path):
         told.update(_done(process.communicate()[1]))
     process = start()
     deadline = time.monotonic() + 120
-    while len(list((out / "ender3").glob("*.stillpath.gcode"))) < 24 and time.monotonic() < deadline:
+    done = out / "ender3"
+    while len(list(done.glob("*.gcode"))) < 24 and time.monotonic() < deadline:
         time.sleep(0.1)
     process.send_signal(signal.SIGTERM)
     told.update(_done(process.communicate(timeout=60)[1]))
