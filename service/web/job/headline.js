@@ -21,7 +21,7 @@ export function headline(report, channels) {
   const said = (/** @type {string} */ name) => umOrRange(rms[name], ranges[name]);
   const label = `Contour error ${extrudes ? (selected.length ? "where it is compensated" : "while extruding") : "of all motion (nothing is extruded)"}, rms`;
   const rubbing = extrudes ? Object.fromEntries(channels.map((c) => [c.name, c.contour_rubbing_um])) : {};
-  const ifGuidesRub = rubbing.after ? `. If guides rub, which resonance tables do not show: up to ${um(rubbing.after)} (${um(rubbing.before)} as sliced)` : "";
+  const ifGuidesRub = rubbing.after ? `. If guides rub, which was not measured: up to ${um(rubbing.after)} (${um(rubbing.before)} as sliced)` : "";
   const ratio = rms.before / rms.after;
   const change = 100 * (report.time_s / report.original_time_s - 1);
   return h("section.headline", { "aria-label": "Headline" },
