@@ -1,10 +1,11 @@
 """Fit few straight constant-speed segments to a sampled command within a tolerance.
 
-One pass over X, Y, Z and E together: a funnel of admissible slopes starts at the end of the last
-segment and narrows with every sample; when it closes, the segment ends. The tolerance across the
-path, which is visible on the part, is tighter than along it. Within the funnel the end point is
-chosen by noise shaping: the error of a fit with some 200 corners per second lies right at a
-machine's resonances, and is moved to frequencies at which the machine does not respond.
+One pass over X, Y, Z and E together chooses when segments end: a funnel of admissible slopes starts
+at the end of the last segment and narrows with every sample; when it closes, the segment ends. The
+tolerance across the path, which is visible on the part, is tighter than along it. Then the ends of
+each stretch are moved such that the machine responds least to the error, by least squares: that
+halves its response to as many segments, because an error around 200 Hz remains and slower ones
+vanish.
 """
 
 from __future__ import annotations
@@ -12,27 +13,21 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solveh_banded
 
-from stillpath.gcode._segment_kernels import (
-    LONGEST,
-    Answers,
-    Bounds,
-    fit_stretch,
-    path_directions,
-    rest_errors,
-)
+from stillpath.gcode._least_squares_kernels import Weight, normal_equations, reach
+from stillpath.gcode._segment_kernels import Bounds, choose_ends, path_directions
 from stillpath.gcode.timeline import Timeline
 from stillpath.models.modal import modal_form
 from stillpath.models.plants import DiscretePlant
 
-__all__ = ["ErrorFilter", "Segments", "across_tolerance_mm", "fit_segments"]
+__all__ = ["ErrorFilter", "Segments", "fit_segments"]
 
-ALONG_SHARE = 0.8
-LOOSE_MM = 0.3e-3
+ALONG_SHARE, ACROSS_SHARE = 0.8, 0.5
+LOOSE_SHARE = 0.15
 FULL_GAIN = 5.0
 BEYOND_MODEL = 0.5
 """Added to a machine's response to an error. A model ends with its band, a machine does not: all of
@@ -45,6 +40,9 @@ END_SPEED_MM_S = 8.0
 END_EXCESS_MM = 1.5e-3
 SHORTEST_S = 0.5e-3
 """Samples nearer than this to the start of a stretch are not ends of segments."""
+_LAGS = 32
+"""Samples over which errors count together. A machine's memory is longer, but taken whole it halves
+the machine's response no further."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,8 +93,8 @@ class ErrorFilter:
     Notes
     -----
     `share` is the share of the tolerance that is used: all of it up to a resonance of `FULL_GAIN`.
-    The response to an error e is direct e + sum of Re(weight x) with x <- pole x + e. `answers` is
-    for the kernel; sums of products of responses are geometric series.
+    The response to an error e is direct e + sum of Re(weight x) with x <- pole x + e. `costs` says
+    for each axis how errors count: by the energy of that response.
     """
 
     def __init__(self, plants: Sequence[DiscretePlant]) -> None:
@@ -112,14 +110,10 @@ class ErrorFilter:
             if len(form) or plant.order == 0:
                 direct[i] = plant.d
         self.pole, self.weight, self.direct = pole, weight, direct
-        tables = [_tables(*axis) for axis in zip(pole, weight, direct + BEYOND_MODEL, strict=True)]
-        self.answers = Answers(pole, *(np.stack(table) for table in zip(*tables, strict=True)))
+        self.costs = [
+            _cost(*axis) for axis in zip(pole, weight, direct + BEYOND_MODEL, strict=True)
+        ]
         self.share = float(np.clip(FULL_GAIN / _peak_gain(pole, weight, direct), 0.5, 1.0))
-
-
-def across_tolerance_mm(tolerance_mm: float) -> float:
-    """Tolerance across the path: half of it, but no finer than it takes, 1 um up to 5 um."""
-    return max(0.2 * tolerance_mm, min(0.5 * tolerance_mm, 1e-3))
 
 
 def fit_segments(
@@ -129,6 +123,7 @@ def fit_segments(
     error_filter: ErrorFilter,
     *,
     step_mm_s: float = np.inf,
+    feed_step_mm_s: float = np.inf,
     grid_mm: float = 1e-3,
     ends: NDArray[np.bool_] | None = None,
 ) -> Segments:
@@ -146,27 +141,28 @@ def fit_segments(
         The machine's response to the error.
     step_mm_s : float
         Segments are cut short where the speed of an axis would step by more.
+    feed_step_mm_s : float
+        The same for the extruder, at one speed along the path.
     grid_mm : float
         X and Y of all vertices but the last of a stretch are multiples of this.
     ends : ndarray of bool, shape (n,), optional
         Samples at which a segment must end.
     """
-    # A vertex on a coarse grid (whole motor steps) is up to half a grid step off.
-    slack_mm = max(0.5 * (grid_mm - tolerance_mm), 0.0)
+    used_mm = error_filter.share * tolerance_mm
     bounds = Bounds(
-        along_mm=ALONG_SHARE * error_filter.share * tolerance_mm + slack_mm,
-        across_mm=error_filter.share * across_tolerance_mm(tolerance_mm) + slack_mm,
-        loose_mm=LOOSE_MM,
+        along_mm=ALONG_SHARE * used_mm,
+        across_mm=ACROSS_SHARE * used_mm,
+        loose_mm=LOOSE_SHARE * used_mm,
         z_mm=Z_TOLERANCE_MM,
         e_mm=E_TOLERANCE_MM,
         step_mm_s=step_mm_s,
+        feed_step_mm_s=feed_step_mm_s,
     )
     samples = command_mm.shape[1]
     ends = np.zeros(samples, np.bool_) if ends is None else ends
     fit = _Fit(timeline, command_mm, error_filter, bounds, grid_mm, ends)
     for i, group in enumerate(timeline.groups):
         if group.rest:
-            fit.rest(timeline.end_s[i] - timeline.start_s[i])
             continue
         start_s = timeline.end_s[i - 1] if i else 0.0
         last = round(timeline.end_s[i] / timeline.dt_s)
@@ -178,7 +174,7 @@ def fit_segments(
 
 
 class _Fit:
-    """The segments of a piece so far, and the machine's errors at their end."""
+    """The segments of a piece so far."""
 
     def __init__(
         self,
@@ -191,19 +187,14 @@ class _Fit:
     ) -> None:
         self._timeline, self._command_mm, self._bounds = timeline, command_mm, bounds
         self._filter, self._grid_mm, self._ends = error_filter, grid_mm, ends
-        capacity = command_mm.shape[1] + len(timeline.groups)
-        self._end_s, self._end_mm = np.empty(capacity), np.empty((4, capacity))
-        self._groups = np.empty(capacity, dtype=np.int64)
-        self._direction = np.empty((2, command_mm.shape[1]))
+        samples = command_mm.shape[1]
+        capacity = samples + len(timeline.groups)
+        self._sample, self._groups = np.empty((2, capacity), np.int64)
+        self._end_mm = np.empty((4, capacity))
+        self._direction = np.empty((2, samples))
         path_directions(timeline.position_mm[:2], self._direction)
-        self._states = np.zeros_like(error_filter.answers.pole)
-        self._errors = np.empty(LONGEST)
+        self._scratch = np.empty((2, samples))
         self._count = 0
-
-    def rest(self, duration_s: float) -> None:
-        """Let errors decay."""
-        samples = round(duration_s / self._timeline.dt_s)
-        rest_errors(self._filter.answers.pole, self._states, samples)
 
     def stretch(self, i: int, start_s: float, first: int, last: int, crawl_mm: float) -> None:
         """Fit group i, which begins at `start_s`, with ends at samples `first` to `last`.
@@ -214,11 +205,10 @@ class _Fit:
         before = int(np.floor(start_s / timeline.dt_s + 1e-6))
         # Z and E moved in the rest before; X and Y stand where the command left them.
         begin = np.concatenate([command_mm[:2, before], timeline.group_start_mm[i, 2:]])
-        n = fit_stretch(
+        n = choose_ends(
             command_mm,
             self._direction,
             self._bounds,
-            self._grid_mm,
             timeline.dt_s,
             start_s,
             first,
@@ -226,29 +216,52 @@ class _Fit:
             begin,
             bool(np.all(command_mm[2, first : last + 1] == begin[2])),
             self._ends,
-            self._filter.answers,
-            self._states,
-            self._errors,
             count,
-            self._end_s,
+            self._sample,
             self._end_mm,
         )
+        sample, end_mm = self._sample[count:], self._end_mm[:, count:]
         if timeline.groups[i].before_z:
-            end_s, end_mm = self._end_s[count:], self._end_mm[:, count:]
-            n = _merge_crawl(end_s, end_mm, n, command_mm, timeline.dt_s, crawl_mm)
+            n = _merge_crawl(sample, end_mm, n, command_mm, timeline.dt_s, crawl_mm)
+        self._settle(np.append(before, sample[:n]), begin, end_mm[:, :n])
         self._groups[count : count + n] = i
         self._count += n
 
+    def _settle(
+        self, knot: NDArray[np.int64], begin: NDArray[np.float64], end_mm: NDArray[np.float64]
+    ) -> None:
+        """Move all ends (4, n) but the last, in place, to where the machine responds least."""
+        inner = knot[1:-1]
+        if len(inner) == 0:
+            return
+        place = self._command_mm[:2, knot]
+        shift = np.empty((2, len(inner)))
+        for axis, cost in enumerate(self._filter.costs):
+            above = reach(knot, len(cost.correlation))
+            band = np.zeros((above + 1, len(inner)))
+            command, (error, felt) = self._command_mm[axis], self._scratch
+            normal_equations(command, knot, cost, error, felt, band, shift[axis])
+            shift[axis] = solveh_banded(band, shift[axis], overwrite_ab=True, check_finite=False)
+        end_mm[:2, :-1] = self._grid_mm * np.round((place[:, 1:-1] + shift) / self._grid_mm)
+        # Filament per mm stays as it was: Klipper brakes where it changes.
+        step = np.diff(place, axis=1)
+        length = np.maximum(np.hypot(*step), 1e-9)
+        feed = np.diff(end_mm[3], prepend=begin[3]) / length
+        even = np.minimum(np.abs(feed[1:]), np.abs(feed[:-1])) * np.sign(feed[1:])
+        along = np.sum(shift * step[:, 1:], axis=0) / length[1:]
+        end_mm[3, :-1] += np.where(feed[1:] * feed[:-1] > 0.0, even * along, 0.0)
+
     def segments(self) -> Segments:
         """Return the fitted segments."""
-        end_s, end_mm, groups = (
-            a[..., : self._count] for a in (self._end_s, self._end_mm, self._groups)
+        rows = slice(self._count)
+        end_s = self._timeline.dt_s * self._sample[rows]
+        return Segments(
+            end_s, self._end_mm[:, rows].copy(), self._groups[rows].copy(), self._filter
         )
-        return Segments(end_s.copy(), end_mm.copy(), groups.copy(), self._filter)
 
 
 def _merge_crawl(
-    end_s: NDArray[np.float64],
+    sample: NDArray[np.int64],
     end_mm: NDArray[np.float64],
     n: int,
     command_mm: NDArray[np.float64],
@@ -259,18 +272,17 @@ def _merge_crawl(
     last = n - 1
     keep = n
     while keep > 2:
-        begin_s, begin = end_s[keep - 2], end_mm[:2, keep - 2]
-        way = np.hypot(*(end_mm[:2, last] - begin))
-        if way >= END_SPEED_MM_S * (end_s[last] - begin_s):
+        way = np.hypot(*(end_mm[:2, last] - end_mm[:2, keep - 2]))
+        if way >= END_SPEED_MM_S * dt_s * (sample[last] - sample[keep - 2]):
             break
-        begin_s, begin = end_s[keep - 3], end_mm[:2, keep - 3]
-        k = np.arange(round(begin_s / dt_s), round(end_s[last] / dt_s) + 1)
-        share = (k * dt_s - begin_s) / (end_s[last] - begin_s)
+        begin = end_mm[:2, keep - 3]
+        k = np.arange(sample[keep - 3], sample[last] + 1)
+        share = (k - k[0]) / (k[-1] - k[0])
         line = begin[:, None] + share * (end_mm[:2, last] - begin)[:, None]
         if np.max(np.hypot(*(line - command_mm[:2, k]))) > allowed_mm:
             break
         keep -= 1
-    end_s[keep - 1] = end_s[last]
+    sample[keep - 1] = sample[last]
     end_mm[:, keep - 1] = end_mm[:, last]
     return keep
 
@@ -285,11 +297,11 @@ def _peak_gain(
     return float(np.max(np.abs(direct[:, None] + 0.5 * sums.sum(axis=2))))
 
 
-def _tables(
+def _cost(
     pole: NDArray[np.complex128], weight: NDArray[np.complex128], direct: np.float64
-) -> list[NDArray[Any]]:
-    """`power`, `head`, `echo`, `lift` and `norm` of one axis (`Answers`)."""
-    lag = np.arange(2 * LONGEST)
+) -> Weight:
+    """Return how errors of an axis count."""
+    lag = np.arange(_LAGS)
     power = pole ** lag[:, None]
     # Summed products of two responses: a geometric series for every pair of poles.
     series = (
@@ -299,16 +311,16 @@ def _tables(
     pairs = 0.5 * np.sum(series, axis=(0, 2))
     impulse = np.append(direct, (power[:-1] @ weight).real)
     correlation = (power @ (weight * pairs)).real + direct * impulse
-    # Errors that rise over m samples and fall over the next ones, a row for every m.
-    count = np.arange(LONGEST + 1)[:, None]
-    triangle = np.maximum(np.minimum(lag + 1, 2 * count - lag - 1), 0) / np.maximum(count, 1)
-    echo = triangle @ correlation[np.abs(lag[:, None] - lag)]
-    lift = np.zeros((LONGEST + 1, len(pole)), complex)
-    lift[1:] = np.cumsum(np.cumsum(power[:LONGEST], axis=0), axis=0) / count[1:]
-    return [
-        power[: LONGEST + 1],
-        (triangle @ power) * weight * (direct + pole * pairs),
-        echo[:, :LONGEST],
-        lift,
-        np.sum(triangle * echo, axis=1),
-    ]
+    # A triangle's spectrum is nowhere negative, nor is that of its product with a correlation.
+    return weighing(correlation * (1.0 - lag / _LAGS))
+
+
+def weighing(correlation: NDArray[np.float64]) -> Weight:
+    """Return the weight of errors with this correlation, shape (lags,), and its moments."""
+    lags = len(correlation)
+    bend, moment = np.zeros((2, lags + 3))
+    bend[1] = 0.5 * correlation[0]
+    for k in range(1, lags + 2):
+        bend[k + 1] = 2.0 * bend[k] - bend[k - 1] + (correlation[k] if k < lags else 0.0)
+        moment[k + 1] = 2.0 * moment[k] - moment[k - 1] + bend[k]
+    return Weight(correlation, moment[: lags + 2], bend[lags : lags + 2].copy())

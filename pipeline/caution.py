@@ -69,9 +69,10 @@ _UNSEEN_SHARE = 0.85
 _PRICE = 0.5
 """Weight, in the ranking, of the worst member's error in excess of the shaper's. Members contradict
 each other: fully protecting the least likely one would mean not compensating the others."""
-_COARSE_UM, _LEAST_FIT = 4.0, 0.5
+_COARSE_UM, LEAST_FIT = 4.0, 0.25
 """Contour error from which segments may use their full tolerance, and the least share of it below:
-on a well-known machine the segments would otherwise be the larger error."""
+on a well-known machine the segments would otherwise be the larger error. With these and the default
+tolerance they add about a hundredth to the error."""
 _STRIDE = 5
 _NO_RESTS = np.zeros((0, 2), np.int64)
 
@@ -106,11 +107,11 @@ class Choice:
     def fit_share(self) -> float:
         """Share of the tolerance that a fit to the command may use.
 
-        A shaper's command has more edges: fitted to 2 um it leaves up to 1.2 times its error.
+        A shaper's command has more edges: fitted to 2 µm it leaves up to 1.2 times its error.
         """
         if not any(self.shares):
-            return _LEAST_FIT
-        return float(np.clip(self.rms_um / _COARSE_UM, _LEAST_FIT, 1.0))
+            return LEAST_FIT
+        return float(np.clip(self.rms_um / _COARSE_UM, LEAST_FIT, 1.0))
 
     def ranged(self, channels: Sequence[Channel], *, steps: bool) -> list[Channel]:
         """Return the channels of a report with the range over the members."""

@@ -101,11 +101,12 @@ class Options(BaseModel):
         default=None, ge=1, le=10_000, description="Which plate of a 3MF package with several."
     )
     tolerance_um: float = Field(
-        default=2.0,
+        default=4.0,
         ge=0.5,
         le=50,
         allow_inf_nan=False,
-        description="How far the written path may be from the computed one.",
+        description="How far the written path may be from the computed one; less where the machine "
+        "is known well.",
     )
     times: Literal["new", "kept"] = Field(
         default="new", description="Whether the slicer's times in the file follow the new motion."
@@ -127,8 +128,8 @@ class Options(BaseModel):
     max_mb: MaxMb | None = Field(
         default=None,
         description="The most that the G-code may have, in millions of bytes: what is visible is "
-        "compensated, then less exactly (tolerances of 8 and 16 um), then outer walls alone, until "
-        "it fits.",
+        "compensated, then less exactly (tolerances of 8 to 24 um), then outer walls alone, "
+        "until it fits.",
     )
     compare_live: bool = Field(
         default=False,

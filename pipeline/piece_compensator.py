@@ -46,7 +46,12 @@ DT_S = 1e-3
 
 _REST_TOLERANCE_S = 5e-3
 _ROUNDS = 2
-MIN_STEP_MM_S = 5.0
+_STEP_SHARE = 0.5
+"""Share of what motors bear by which the speed steps from segment to segment."""
+_UNKNOWN_FIT = 0.5
+"""Share of the tolerance that is used where no set says how well the machine is known."""
+_COARSE_MM, _COARSE_GRID_MM = 5e-3, 1e-3
+"""Tolerance from which three decimals do: files are 5 % smaller."""
 _ACCEL_SHARES = (1.0, 0.8, 0.6, 0.5)
 """Shares of the largest acceleration, tried in turn where a motor's speed step is too large."""
 _SOFT_S = (2e-3, 4e-3, 8e-3)
@@ -110,7 +115,7 @@ class PieceCompensator:
     ) -> None:
         self._machine = machine
         self.compensator = _designed(machine, options, shaper, caution)
-        fit_share = 1.0 if caution is None else caution.fit_share
+        fit_share = _UNKNOWN_FIT if caution is None else caution.fit_share
         self._tolerance_mm = 1e-3 * options.tolerance_um * fit_share
         firmware = adapter(machine)
         self.encoder = firmware.encoder()
@@ -234,19 +239,21 @@ class PieceCompensator:
         """Return segments and moves, finer where a motor's speed step would be too large."""
         limit = self._machine.command.speed_step_mm_s
         tolerance = self._tolerance_mm
-        # Speed steps are limited to the largest change of the command's speed within a sample.
-        step_mm_s = max(bend_mm / timeline.dt_s, MIN_STEP_MM_S)
+        # The command's own speed may change by more within a sample.
+        step_mm_s = max(bend_mm / timeline.dt_s, _STEP_SHARE * limit)
         for _ in range(3):
+            grid_mm = max(self.encoder.grid_mm, _COARSE_GRID_MM if tolerance >= _COARSE_MM else 0.0)
             segments = fit_segments(
                 timeline,
                 command,
                 tolerance,
                 self._filter,
                 step_mm_s=step_mm_s,
-                grid_mm=self.encoder.grid_mm,
+                feed_step_mm_s=self.encoder.feed_step_mm_s,
+                grid_mm=grid_mm,
                 ends=timeline.starts(piece.marked_rows),
             )
-            self._keep_inside(segments)
+            self._keep_inside(segments, grid_mm)
             encoded = self.encoder.encode(piece, timeline, segments)
             if len(encoded.row) == 0:
                 line = int(piece.moves.line[0])
@@ -260,9 +267,8 @@ class PieceCompensator:
             f"allows {limit:.0f} mm/s (command.speed_step_mm_s)"
         )
 
-    def _keep_inside(self, segments: Segments) -> None:
+    def _keep_inside(self, segments: Segments, grid_mm: float) -> None:
         """Clamp vertices that the fit's tolerance or the grid would put off the bed."""
-        grid_mm = self.encoder.grid_mm
         for i, axis in enumerate(("x", "y")):
             travel = self._machine.travel[axis]  # type: ignore[index]
             # Outermost grid lines on the bed, with a margin for rounding.

@@ -79,6 +79,10 @@ class Encoder(Protocol):
     def grid_mm(self) -> float:
         """Grid of the X and Y that it writes; the segments are fitted on it."""
 
+    @property
+    def feed_step_mm_s(self) -> float:
+        """Step of the extruder's speed, from a change of filament per mm, that costs no time."""
+
     def rest_durations(self, piece: Piece, groups: Sequence[Group]) -> NDArray[np.float64]:
         """Return a first estimate of the duration of each rest between stretches."""
 

@@ -62,7 +62,9 @@ def test_a_tilted_plane_keeps_the_times(slope: float, kind: str) -> None:
     bound = 0.5 * slope**2 * seconds(level)
     assert -1e-5 <= longer <= bound + 1e-5
     late_mm = bound * float(np.max(level.cruise_mm_s))
-    assert deviation(made, tilted).max() <= deviation(made, level).max() + late_mm + 1e-3
+    # Marlin's whole steps fall differently.
+    late_mm += 5e-3 if kind == "marlin" else 1e-3
+    assert deviation(made, tilted).max() <= deviation(made, level).max() + late_mm
     np.testing.assert_allclose(tilted.direction[-1, :2], level.direction[-1, :2], atol=1e-4)
 
 

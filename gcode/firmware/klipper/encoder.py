@@ -46,6 +46,8 @@ um would be noise at all frequencies, which a resonance above the model's band a
 (docs/tried.md)."""
 _Z_GRID = 10
 """On a 1 um grid a slow climb, as in a vase, is flat and then too steep for Z's acceleration."""
+_FEED_SHARE = 0.7
+"""Of the step of the extruder's speed for which Klipper brakes: ends are moved after the fit."""
 _PASSES = 4
 _TIME_TOLERANCE_S = 2e-6
 
@@ -92,6 +94,7 @@ class KlipperEncoder:
 
     def __init__(self, firmware: Klipper, limits: KlipperLimits) -> None:
         self._firmware, self._limits = firmware, limits
+        self.feed_step_mm_s = _FEED_SHARE * firmware.extruder.instantaneous_corner_velocity_mm_s
         self._grids = np.array([_GRID, _GRID, _Z_GRID])
 
     def rest_durations(self, piece: Piece, groups: Sequence[Group]) -> NDArray[np.float64]:

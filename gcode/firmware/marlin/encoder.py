@@ -180,6 +180,7 @@ class MarlinEncoder:
 
     grid_mm = 1e-3
     """Much finer than a step; the encoder itself puts vertices on steps."""
+    feed_step_mm_s = math.inf
 
     def rest_durations(self, piece: Piece, groups: Sequence[Group]) -> NDArray[np.float64]:
         """Return estimated durations of rests: those of the original plan."""

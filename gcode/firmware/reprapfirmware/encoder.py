@@ -128,6 +128,7 @@ class RepRapEncoder:
 
     grid_mm = 1e-3
     """Much finer than a step; the encoder itself puts vertices on steps."""
+    feed_step_mm_s = math.inf
 
     def __init__(
         self,
