@@ -88,6 +88,7 @@ def test_arcs_shift_no_axis_against_the_other(speed_mm_s: float) -> None:
     for plants in machine.axes.values():
         assert isinstance(plants.nominal, RelativeModesSpec)
         modes = plants.nominal.modes
+        # Of third order in the rate of turning, as a share of the radius.
         own.append(sum(m.share * 2 * m.zeta * (rate / (2 * np.pi * m.f_hz)) ** 3 for m in modes))
     assert abs(lead.mean()) < 1e-4 + radius * max(own)
 

@@ -1,4 +1,8 @@
-"""What the machine's state is at every line of a file, and how two files differ in it."""
+"""What the machine's state is at every line of a file, and how two files differ in it.
+
+The strongest check of a written file: every line that came from the original must find the
+machine as it was in the original: position, filament, modes, F and limits.
+"""
 
 from __future__ import annotations
 
@@ -132,7 +136,10 @@ def states(data: bytes, machine: Machine) -> list[State]:
 
 
 def differences(original: bytes, written: bytes, machine: Machine) -> list[str]:
-    """Say where the written file treats a line of the (tagged) original differently."""
+    """Say where the written file treats a line of the (tagged) original differently.
+
+    Both may begin with the same byte order mark, though not with the same line.
+    """
     if original.startswith(BOM_UTF8):
         assert written.startswith(BOM_UTF8)
         original, written = (text.removeprefix(BOM_UTF8) for text in (original, written))

@@ -110,6 +110,7 @@ def test_waits_of_a_queue_leave_no_motor_behind(factor: float) -> None:
     ends_s = phases.end_s
     waits_s = np.maximum(phases.t_s[1:] - ends_s[:-1], 0.0)
     late_mm = waits_s * np.minimum(phases.end_mm_s[:-1], phases.start_mm_s[1:])
+    # A quarter of a full step (.2 mm), where the motor still has most of its torque.
     assert late_mm.max() <= 0.05
 
 
