@@ -90,6 +90,11 @@ def test_other_comments_mark_nothing(comment: str) -> None:
     assert read_mark(comment) is None
 
 
+def test_numbers_of_marks() -> None:
+    assert Mark(K.Z, ".2").value_mm == 0.2
+    assert Mark(K.FEATURE, "Outer wall").value_mm is None
+
+
 @pytest.mark.parametrize(
     ("names", "feature"),
     [
