@@ -137,20 +137,6 @@ def test_robust_is_422_with_428() -> None:
         )
 
 
-def test_robust_basis_is_best() -> None:
-    lifted = plant_set()
-
-    def error(psi: np.ndarray) -> float:
-        c = psi @ np.linalg.solve(psi.T @ lifted.gram @ psi, psi.T @ lifted.mean.T)
-        return robust_error_metric(lifted, c)
-
-    best = error(robust_basis(lifted.gram, lifted.mean, 20))
-    rng = np.random.default_rng(1)
-    others = [BASES[name](lifted, 20) for name in ("dct", "bspline", "ce-opt")]
-    others += [orthonormal(rng.normal(size=(M, 20))) for _ in range(10)]
-    assert all(error(psi) > best for psi in others)
-
-
 def test_422_as_printed() -> None:
     lifted = plant_set()
     nominal = lift(markov(count=1)[0], M).dense()

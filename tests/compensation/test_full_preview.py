@@ -24,13 +24,10 @@ from stillpath.compensation.operators import (
     ProductOperator,
     ToeplitzOperator,
 )
-from stillpath.models.plants import DiscretePlant, Mode, ModesSpec, discretise
+from stillpath.models.plants import DiscretePlant
+from tests.plants import one_mode
 
 M = 90
-
-
-def one_mode(f_hz: float = 40.0, zeta: float = 0.05) -> DiscretePlant:
-    return discretise(ModesSpec(modes=(Mode(f_hz=f_hz, zeta=zeta),)), 1e-3)
 
 
 def first_order(a: float, p: float = 0.5) -> DiscretePlant:
@@ -262,26 +259,12 @@ G = lift(one_mode(), M)
         (lambda: FullPreview(G, np.ones((M, 2))), r"dependent before any filtering \(rank 1\)"),
         (lambda: FullPreview(G, np.full((M, 2), np.nan)), "not finite"),
         (lambda: FullPreview(DenseOperator(np.zeros((M, M))), np.eye(M)[:, :3]), "answers none"),
-        (lambda: FullPreview([], np.eye(M)), "set of plants is empty"),
-        (lambda: FullPreview([G, G], np.eye(M)[:, :3], weights=[1, 1]), "sum to 2, must be 1"),
         (lambda: FullPreview(lifted_set([G.markov], [1.0]), np.eye(M), weighting=G), "LiftedSet"),
         (lambda: FullPreview(G, np.eye(M)[:, :3], states=np.ones((2, 3))), "need one plant"),
-        (
-            lambda: FullPreview(
-                G, np.eye(M)[:, :3], states=np.ones((2, 2)), responses=np.ones((M, 2))
-            ),
-            r"filter states \(2, 2\) with responses \(90, 2\)",
-        ),
         (lambda: FullPreview(G, np.eye(M)[:, :3]).initial_state(path()), "without filter"),
         (lambda: FullPreview(G, np.eye(M)[:, :3]).command(np.ones(M - 1)), r"path of shape \(89,"),
         (lambda: FullPreview(G, np.eye(M)[:, :3]).commands(path(), [4]), "4 to 4 of 3 functions"),
         (lambda: independence(one_mode(), np.eye(M), np.ones((1, M))), r"\(2, 90\) needed"),
-        (
-            lambda: independence(
-                DiscretePlant(np.array([[1.5]]), np.ones(1), np.ones(1), 0.0), np.eye(M)
-            ),
-            "unstable: largest pole",
-        ),
     ],
 )  # fmt: skip
 def test_messages(make, message: str) -> None:

@@ -8,11 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stillpath.compensation._lifted_kernels import run_adjoint, run_forward
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.lifted import (
     free_response,
-    integrated,
     lift,
     lifted_set,
     lifted_set_of,
@@ -23,16 +21,12 @@ from stillpath.compensation.operators import (
     DenseOperator,
     LiftedOperator,
     ProductOperator,
-    TimeVaryingOperator,
     ToeplitzOperator,
 )
-from stillpath.models.plants import DiscretePlant, Mode, ModesSpec, discretise
+from stillpath.models.plants import DiscretePlant
+from tests.plants import one_mode
 
 RNG = np.random.default_rng
-
-
-def one_mode(f_hz: float = 40.0, zeta: float = 0.05) -> DiscretePlant:
-    return discretise(ModesSpec(modes=(Mode(f_hz=f_hz, zeta=zeta),)), 1e-3)
 
 
 def random_plants(rng: np.random.Generator, count: int, order: int = 3) -> list[DiscretePlant]:
@@ -130,26 +124,6 @@ def test_time_varying_plant_keeps_its_state() -> None:
     np.testing.assert_allclose(g.free_response(x0), expected, atol=1e-12)
 
 
-def test_a_plant_that_does_not_change_is_toeplitz() -> None:
-    plant = one_mode()
-    np.testing.assert_allclose(
-        time_varying([plant, plant], [0, 13], 40).dense(), lift(plant, 40).dense(), atol=1e-12
-    )
-
-
-def test_kernels_are_their_source() -> None:
-    plants = random_plants(RNG(8), 2)
-    system = [np.stack([getattr(p, part) for p in plants]) for part in ("a", "b", "c")]
-    d, which = np.array([p.d for p in plants]), np.array([0, 0, 1, 1, 0])
-    u = RNG(9).normal(size=(5, 3))
-    for compiled in (run_forward, run_adjoint):
-        state = [np.zeros((3, 3))] if compiled is run_forward else []
-        fast, plain = np.empty_like(u), np.empty_like(u)
-        compiled(*system, d, which, u, *[s.copy() for s in state], fast)
-        compiled.py_func(*system, d, which, u, *state, plain)
-        np.testing.assert_allclose(fast, plain, atol=1e-14)
-
-
 @given(st.integers(1, 8), st.integers(1, 30), st.integers(0, 2**31))
 @settings(max_examples=40)
 def test_set_by_displacement_is_the_dense_sum(members: int, m: int, seed: int) -> None:
@@ -166,23 +140,6 @@ def test_set_by_displacement_is_the_dense_sum(members: int, m: int, seed: int) -
     assert got.samples == dense.samples == m
 
 
-def test_set_of_two_axes() -> None:
-    g, h = ToeplitzOperator([1.0, 0.5, 0.2]), ToeplitzOperator([0.0, 1.0, 0.1])
-    members = [BlockOperator([[g, h]]), BlockOperator([[h, h]])]
-    lifted = lifted_set_of(members, [0.3, 0.7], inputs=2)
-    assert lifted.gram.shape == (6, 6)
-    assert lifted.mean.shape == (3, 6)
-    assert lifted.samples == 3
-
-
-def test_integrators() -> None:
-    h = RNG(2).normal(size=12)
-    v = RNG(3).normal(size=12)
-    np.testing.assert_allclose(
-        lift(integrated(h), 12).apply(v), lift(h, 12).apply(np.cumsum(np.cumsum(v))), atol=1e-12
-    )
-
-
 UNSTABLE = DiscretePlant(np.array([[1.02]]), np.ones(1), np.ones(1), 0.0)
 
 
@@ -193,7 +150,6 @@ UNSTABLE = DiscretePlant(np.array([[1.02]]), np.ones(1), np.ones(1), 0.0)
         (lambda: lifted_set(np.ones((2, 5)), [1.2, -0.2]), r"weight -0.2 .* not be negative"),
         (lambda: lifted_set(np.ones((2, 5)), [0.5, 0.6]), r"sum to 1.1, must be 1"),
         (lambda: lifted_set(np.ones((2, 5)), [1.0]), r"weights of shape \(1,\) for 2 plants"),
-        (lambda: lifted_set(np.ones((2, 5)), [np.nan, 1.0]), "must not be negative"),
         (lambda: lift(UNSTABLE, 10), r"unstable: largest pole \|z\| = 1.02, .* feedback"),
         (lambda: time_varying([one_mode(), UNSTABLE], [0, 3], 9), r"orders \[1, 2\]"),
         (lambda: time_varying([UNSTABLE], [0], 9), "plant 0 of the time-varying system is unst"),
@@ -206,17 +162,7 @@ UNSTABLE = DiscretePlant(np.array([[1.02]]), np.ones(1), np.ones(1), 0.0)
         (lambda: BlockOperator([[lift([1.0], 4), lift([1.0], 3)]]), r"output 0 .* \[3, 4\]"),
         (lambda: BlockOperator([[lift([1.0], 4), None]]), "input 1 have lengths"),
         (lambda: BlockOperator([[lift([1.0], 4)], []]), "grid"),
-        (
-            lambda: ProductOperator(lift([1.0], 4), lift([1.0], 3)),
-            r"\(4, 4\) after \(3, 3\) do not",
-        ),
         (lambda: lifted_set_of([lift([1.0], 4), lift([1.0], 3)], [0.5, 0.5]), "one shape"),
-        (
-            lambda: TimeVaryingOperator(
-                np.zeros((1, 2, 2)), np.zeros((1, 2)), np.zeros((1, 2)), np.zeros(1), np.array([1])
-            ),
-            "names plants 1 to 1 of 1",
-        ),
     ],
 )
 def test_messages(make, message: str) -> None:

@@ -120,15 +120,9 @@ def test_limited_is_as_good_as_full_preview(plant: str, case: Case) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("plant", PLANTS)
-@pytest.mark.parametrize("case", APART, ids=str)
-def test_limited_is_as_good_as_full_preview_26_s(plant: str, case: Case) -> None:
-    agree(plant, case, 26.0)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("plant", PLANTS)
-def test_limited_splines_are_as_good_as_full_preview_60_s(plant: str) -> None:
-    agree(plant, SPLINES, 60.0)
+@pytest.mark.parametrize("case", [SHARP, LONG], ids=str)
+def test_limited_is_as_good_as_full_preview_13_s(plant: str, case: Case) -> None:
+    agree(plant, case, 13.0)
 
 
 def test_longer_windows_come_closer() -> None:
@@ -139,24 +133,13 @@ def test_longer_windows_come_closer() -> None:
 SETS = {"zeta .005": [one_mode(zeta=0.005)], "taz6-x": [taz()], "9 members": nine_members()}
 
 
-def stays(members: str, case: Case, samples: int) -> None:
-    found = deviations(case.design(SETS[members]), samples)
-    assert 0 < found.first < 5.0
-    assert found.overall <= found.first + 1e-6
-    assert found.last <= found.first + 1e-6
-
-
 @pytest.mark.parametrize("members", SETS)
 @pytest.mark.parametrize("case", [SHARP, PRODUCT], ids=str)
 def test_no_drift(members: str, case: Case) -> None:
-    stays(members, case, 200_000)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("members", SETS)
-@pytest.mark.parametrize("case", [SHARP, PRODUCT], ids=str)
-def test_no_drift_over_a_million_samples(members: str, case: Case) -> None:
-    stays(members, case, 1_000_000)
+    found = deviations(case.design(SETS[members]), 200_000)
+    assert 0 < found.first < 5.0
+    assert found.overall <= found.first + 1e-6
+    assert found.last <= found.first + 1e-6
 
 
 def test_kicked_recursion_comes_back() -> None:

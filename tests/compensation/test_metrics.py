@@ -97,7 +97,7 @@ def test_best_number_is_the_minimum() -> None:
     assert best_number([1.1, 2.0]) == 1
 
 
-@pytest.mark.parametrize("a", [-3.0, 0.4, 2.0])
+@pytest.mark.parametrize("a", [-3.0, 2.0])
 def test_zpetc_by_228(a: float) -> None:
     """E(q) = (a / q - 2 a + a q) / (1 - a)^2."""
     samples = 40

@@ -120,10 +120,6 @@ def test_two_steps_with_a_given_model() -> None:
         (lambda: spread_gram(equal(lags()), np.eye(3)), r"shape \(3, 3\) for plants"),
         (lambda: two_step(equal(lags()), 55, r=10), r"answer 50 directions \(r = 10\)"),
         (lambda: two_step(equal(lags()), 0), "n = 0 robust functions"),
-        (
-            lambda: two_step(equal(lags()), 60, nominal=np.diag([*np.ones(M - 1), 0.0])),
-            r"answer 59 directions \(r = 1\)",
-        ),
     ],
 )
 def test_messages(make, message: str) -> None:

@@ -51,7 +51,7 @@ def density(region: Region, kind: str, r: np.ndarray, theta: np.ndarray) -> np.n
 
 
 @pytest.mark.parametrize("kind", ["uniform", "kernel"])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_it_is_the_minimum_of_the_cost(kind: Distribution, seed: int) -> None:
     """(I.1) integrated by brute force over the box, with r dr dtheta, and minimised over C."""
     g = spread(np.random.default_rng(seed))
@@ -74,9 +74,8 @@ def test_it_is_the_minimum_of_the_cost(kind: Distribution, seed: int) -> None:
     assert 1 - tracked[0] == pytest.approx(best.fun, rel=1e-3)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_sampled_is_the_minimum_over_the_members(seed: int) -> None:
-    rng = np.random.default_rng(seed)
+def test_sampled_is_the_minimum_over_the_members() -> None:
+    rng = np.random.default_rng(0)
     g, weights = spread(rng, 6), rng.dirichlet(np.ones(6))
     response, tracked = robust_response(g, weights, "sampled")
 
@@ -86,29 +85,6 @@ def test_sampled_is_the_minimum_over_the_members(seed: int) -> None:
     c = 1 / response[0]
     assert cost(c) == pytest.approx(1 - tracked[0])
     assert all(cost(c) < cost(c * (1 + 1e-3 * s)) for s in (1, -1, 1j, -1j))
-
-
-def test_limits_of_the_kernels() -> None:
-    g = spread(np.random.default_rng(5), 7, 20)
-    uniform, _ = robust_response(g, distribution="uniform")
-    wide, _ = robust_response(g, r_bandwidth=1e4, theta_bandwidth=1e4)
-    np.testing.assert_allclose(wide, uniform, rtol=1e-7)
-    # Narrow kernels are points: magnitudes and phases apart, those at the edges cut in half.
-    narrow, _ = robust_response(g, r_bandwidth=1e-6, theta_bandwidth=1e-6)
-    region = Region.of(g)
-    share_r, share_theta = (
-        np.where((x == x.min(0)) | (x == x.max(0)), 0.5, 1.0) for x in (region.r, region.theta)
-    )
-    third, second = (np.sum(share_r * region.r**k, axis=0) for k in (3, 2))
-    turn = np.sum(share_theta * np.exp(-1j * region.theta), axis=0) / share_theta.sum(axis=0)
-    np.testing.assert_allclose(narrow, third / (second * turn), rtol=1e-5)
-
-
-def test_closed_form_of_the_uniform_box() -> None:
-    g = np.array([[0.5 * np.exp(0.2j)], [2.0 * np.exp(1.4j)], [1.0 * np.exp(0.7j)]])
-    response, _ = robust_response(g, distribution="uniform")
-    size = 0.75 * (2.0**4 - 0.5**4) / (2.0**3 - 0.5**3) / np.sinc(0.6 / np.pi)
-    assert response[0] == pytest.approx(size * np.exp(0.8j))
 
 
 def test_default_bandwidth() -> None:

@@ -21,18 +21,15 @@ from stillpath.compensation.basis import BASES, bspline_basis, ce_opt_basis
 from stillpath.compensation.lifted import LiftedSet
 from stillpath.compensation.lifted_window import LiftedWindow, lifted_window
 from stillpath.compensation.preview import PreviewDesign
-from stillpath.models.plants import DiscretePlant, Mode, ModesSpec, discretise, plant_set
+from stillpath.models.plants import DiscretePlant, plant_set
 from stillpath.models.reference_motion import reference_motion
 from stillpath.models.store import load_machine
 from stillpath.simulation.measures import contour_error
 from stillpath.simulation.response import response
+from tests.plants import answer, one_mode
 
 DT_S = 1e-3
 WINDOW, UPDATE = 300, 150
-
-
-def one_mode(f_hz: float = 45.0, zeta: float = 0.05) -> DiscretePlant:
-    return discretise(ModesSpec(modes=(Mode(f_hz=f_hz, zeta=zeta),)), DT_S)
 
 
 def members(count: int, window: int = WINDOW, update: int = UPDATE) -> LiftedWindow:
@@ -86,15 +83,6 @@ def direct(design: PreviewDesign, plants: list[DiscretePlant], path: np.ndarray)
     return np.array(u)
 
 
-def answer(plant: DiscretePlant, u: np.ndarray, x: np.ndarray | None = None) -> np.ndarray:
-    state = np.zeros(plant.order) if x is None else x.copy()
-    y = np.empty(len(u))
-    for k, value in enumerate(u):
-        y[k] = plant.c @ state + plant.d * value
-        state = plant.a @ state + plant.b * value
-    return y
-
-
 def stroke(samples: int) -> np.ndarray:
     x = np.linspace(0, 1, samples)
     return 20 * (10 * x**3 - 15 * x**4 + 6 * x**5)
@@ -123,7 +111,7 @@ def test_price_is_a_ridge() -> None:
 
 
 def test_lifted_window_is_the_simulation() -> None:
-    plant = one_mode()
+    plant = one_mode(45.0)
     lifted = lifted_window([plant], [1.0], 40, 20)
     rng = np.random.default_rng(1)
     v, x, (u1, u2) = rng.normal(size=40), rng.normal(size=plant.order), rng.normal(size=2)
@@ -134,22 +122,6 @@ def test_lifted_window_is_the_simulation() -> None:
     u = rng.normal(size=20)
     after = lifted.advance @ x + lifted.drive @ u
     np.testing.assert_allclose(after, advance_state(plant.a, plant.b, x, u), atol=1e-12)
-
-
-@pytest.mark.parametrize("basis", BASES)
-@pytest.mark.parametrize("n", [4, 20, 45])
-def test_bases_are_orthonormal(basis: str, n: int) -> None:
-    psi = BASES[basis](members(1, 150, 75).lifted_set(), n)
-    assert psi.shape == (150, n)
-    np.testing.assert_allclose(psi.T @ psi, np.eye(n), atol=1e-10)
-
-
-def test_ce_opt_are_singular_vectors() -> None:
-    g = members(1, 150, 75).integrated[0]
-    psi = ce_opt_basis(g.T @ g, 12)
-    _, sigma, vt = np.linalg.svd(g)
-    assert np.all(np.diff(sigma[:13]) < 0)
-    np.testing.assert_allclose(np.abs(np.sum(psi * vt[:12].T, axis=0)), 1, atol=1e-6)
 
 
 def test_bsplines_span() -> None:
@@ -196,24 +168,9 @@ def test_nearly_dependent_basis_is_refused(monkeypatch: pytest.MonkeyPatch) -> N
         PreviewDesign(members(1), 20)
 
 
-@pytest.mark.parametrize("machine", ["ender3", "voron-v0", "taz6-x"])
-def test_no_drift(machine: str) -> None:
-    """rho(F) < 1 is the stability test: the state of a standing machine fades."""
-    plant = plant_set(load_machine(machine).axes["x"], DT_S).nominal
-    design = PreviewDesign(lifted_window([plant], [1.0], WINDOW, UPDATE), 60, price=0.03)
-    z = design.lifted.rest_state(100.0)
-    u = np.empty(UPDATE * 400)
-    views = np.full((400, WINDOW), 100.0)
-    z[:-2] += 1.0
-    driven = views @ design.path_gain.T
-    run_windows(design.command_gain, design.state_gain, driven, driven @ design.state_drive.T,
-                z, 0, 400, u)  # fmt: skip
-    np.testing.assert_allclose(u[-UPDATE:], 100.0, atol=1e-5)
-
-
 def test_figures_of_the_method() -> None:
     """METHOD 3, 45 Hz / .05: contour rms 1.2 um with n = 60, .3 with n = 100, tens without."""
-    plant = one_mode()
+    plant = one_mode(45.0)
     path, _ = reference_motion()
     before = contour_error(path, response([plant, plant], path), DT_S)
     rms = {0: 1e3 * np.sqrt(np.mean(before**2))}
@@ -275,23 +232,10 @@ def test_twin_of_advance_state(seed: int, order: int, samples: int) -> None:
     np.testing.assert_array_equal(x, kept)
 
 
-@pytest.mark.parametrize(
-    ("weights", "message"),
-    [
-        ([0.5, 0.6], r"sum to 1.1, must be 1"),
-        ([1.5, -0.5], "must not be negative"),
-        ([1.0], "for 2 plants: one for each"),
-    ],
-)
-def test_wrong_weights(weights: list[float], message: str) -> None:
-    with pytest.raises(DesignError, match=message):
-        lifted_window([one_mode(40.0), one_mode(50.0)], weights, 60, 30)
-
-
 def test_wrong_sets() -> None:
     with pytest.raises(DesignError, match="set of plants is empty"):
         lifted_window([], [], 60, 30)
-    good = one_mode()
+    good = one_mode(45.0)
     unstable = dataclasses.replace(good, a=1.2 * good.a)
     with pytest.raises(DesignError, match=r"plant 1 of the set is unstable: .* below 1"):
         lifted_window([good, unstable], [0.5, 0.5], 60, 30)

@@ -15,25 +15,17 @@ from stillpath.models.machine import CommandLimits, Machine
 from stillpath.models.plants import Mode, ModesSpec, PlantSetSpec, continuous
 from stillpath.models.ripple import (
     AxisRipple,
-    RippleHarmonic,
     RippleSide,
-    RippleSource,
     RippleTable,
 )
 from stillpath.models.store import load_machine
 from stillpath.simulation.response import response
 from tests.models.test_ripple import drive as along_x
+from tests.models.test_ripple import ripple as axis_ripple
 
 DT = 1e-3
 FINER = 8
 NO_RESTS = np.zeros((0, 2), np.int64)
-
-
-def axis_ripple(side: RippleSide = "input", **more: float) -> AxisRipple:
-    waves = ((1, 20.0, 10.0), (2, 8.0, 40.0), (3, 4.0, -70.0))
-    harmonics = tuple(RippleHarmonic(number=h, amplitude_um=a, phase_deg=p) for h, a, p in waves)
-    source = RippleSource(name="belt", pitch_mm=2.0, enters=side, harmonics=harmonics)
-    return AxisRipple(sources=(source,), **more)
 
 
 def printer(f_hz: float = 45.0, accel: float = 80_000.0, name: str = "ender3") -> Machine:
@@ -105,7 +97,7 @@ class TestCut:
         path = drive(kind)
         assert cut(undo(path, axis_ripple())[0], path[0]) > 0.99
 
-    @pytest.mark.parametrize("speed", [10.0, 30.0, 60.0, 90.0, 120.0, 180.0])
+    @pytest.mark.parametrize("speed", [10.0, 180.0])
     def test_input_side_at_constant_speeds(self, speed: float) -> None:
         path = drive("constant", speed=speed)
         assert cut(undo(path, axis_ripple())[0], path[0]) > 0.99
@@ -116,7 +108,7 @@ class TestCut:
         u = undo(path, axis_ripple("output"))
         assert cut(u[0], path[0], "output") > 0.97
 
-    @pytest.mark.parametrize("kind", ["constant", "ramp", "stop and go"])
+    @pytest.mark.parametrize("kind", ["constant", "stop and go"])
     @pytest.mark.parametrize("error", [0.95, 1.05])
     def test_learnt_over_passes_with_a_wrong_model(self, kind: str, error: float) -> None:
         """5 % of frequency and 10 um of noise: the map is the input's, so it comes out right."""
@@ -203,13 +195,9 @@ class TestAxes:
         assert received[inner] == pytest.approx((path[0] + path[1])[inner], abs=5e-4)
         assert b[inner] == pytest.approx((path[0] - path[1])[inner], abs=1e-12)
 
-    @pytest.mark.parametrize(
-        ("name", "axis", "side"),
-        [("generic-corexy", "x", "input"), ("ender3", "a", "input"), ("ender3", "b", "output")],
-    )
-    def test_axes_that_are_not_the_machines(self, name: str, axis: str, side: RippleSide) -> None:
+    def test_axes_that_are_not_the_machines(self) -> None:
         with pytest.raises(ValueError, match="belongs to"):
-            rippled(printer(name=name), **{axis: axis_ripple(side)})
+            rippled(printer(name="generic-corexy"), x=axis_ripple())
 
     def test_without_ripple(self) -> None:
         with pytest.raises(DesignError, match="no ripple"):

@@ -114,7 +114,7 @@ def test_bad_shapers_are_refused() -> None:
         shaper_pulses("zv", 0)
     with pytest.raises(DesignError, match=r"between 0 and 0\.2"):
         shaper_pulses("3hump_ei", 40, 0.3)
-    with pytest.raises(DesignError, match="there are fbf"):
+    with pytest.raises(DesignError, match="no compensator is called 'magic'; there are fbf"):
         compensator("magic", load_machine("ender3"), 1e-3)
 
 

@@ -53,8 +53,8 @@ def delayed(machine: Machine, grounded: float) -> Machine:
 
 
 @pytest.mark.parametrize("robust", MODES)
-@pytest.mark.parametrize("speed_mm_s", [20.0, 100.0, 300.0])
-@pytest.mark.parametrize("name", ["ender3", "voron-v0", "voron-v24-250", "annex-k3"])
+@pytest.mark.parametrize("speed_mm_s", [20.0, 300.0])
+@pytest.mark.parametrize("name", ["ender3", "voron-v0", "annex-k3"])
 def test_uniform_motion_stays_where_it_is(name: str, speed_mm_s: float, robust: str) -> None:
     path = ramp(speed_mm_s, 0.6)
     made = command(load_machine(name), path, robust)
@@ -69,12 +69,9 @@ def test_delays_of_members_lead_nothing() -> None:
     np.testing.assert_array_equal(plain, led)
 
 
-@pytest.mark.parametrize("speed_mm_s", [20.0, 100.0, 300.0])
+@pytest.mark.parametrize("speed_mm_s", [20.0, 300.0])
 def test_arcs_shift_no_axis_against_the_other(speed_mm_s: float) -> None:
-    """Over a turn the command neither leads nor lags, but for what the plant does itself.
-
-    That is of third order in the rate of turning: share 2 zeta (rate/w)^3 of the radius.
-    """
+    """Over a turn the command neither leads nor lags, but for what the plant does itself."""
     radius, turns = 30.0, 6
     rate = speed_mm_s / radius
     samples = round(2 * np.pi * turns / rate / DT_S)
@@ -91,6 +88,7 @@ def test_arcs_shift_no_axis_against_the_other(speed_mm_s: float) -> None:
     for plants in machine.axes.values():
         assert isinstance(plants.nominal, RelativeModesSpec)
         modes = plants.nominal.modes
+        # Of third order in the rate of turning, as a share of the radius.
         own.append(sum(m.share * 2 * m.zeta * (rate / (2 * np.pi * m.f_hz)) ** 3 for m in modes))
     assert abs(lead.mean()) < 1e-4 + radius * max(own)
 

@@ -9,12 +9,26 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Iterator
+from pathlib import Path
 
 import heatshrink2
+import pytest
 
 from stillpath.gcode.containers.meatpack import pack
+from stillpath.gcode.containers.opening import open_text, rewriting
+from stillpath.gcode.errors import GcodeError
 
-__all__ = ["binary", "block", "blocks", "members", "normal", "package"]
+__all__ = [
+    "binary",
+    "block",
+    "blocks",
+    "members",
+    "normal",
+    "package",
+    "refused",
+    "rewritten",
+    "text_of",
+]
 
 _METADATA = (
     (0, 0, b"Producer=PrusaSlicer 2.9.4\nProduced on=2026-01-02 at 03:04:05 UTC\n"),
@@ -124,6 +138,29 @@ def members(file: bytes) -> dict[str, bytes]:
     with zipfile.ZipFile(io.BytesIO(file)) as archive:
         assert archive.testzip() is None
         return {info.filename: archive.read(info) for info in archive.infolist()}
+
+
+def text_of(file: bytes, folder: Path, **plate: int) -> bytes:
+    path = folder / "any.name"
+    path.write_bytes(file)
+    with open_text(path, **plate) as container:
+        return container.text.read()
+
+
+def rewritten(file: bytes, text: bytes, folder: Path, **plate: int) -> bytes:
+    source, target = folder / "in", folder / "out"
+    source.write_bytes(file)
+    with (
+        open_text(source, **plate) as container,
+        rewriting(container, target, name=target) as made,
+    ):
+        made.write(text)
+    return target.read_bytes()
+
+
+def refused(file: bytes, folder: Path, words: str, **plate: int) -> None:
+    with pytest.raises(GcodeError, match=words):
+        text_of(file, folder, **plate)
 
 
 def _compressed(data: bytes, how: int) -> bytes:

@@ -15,36 +15,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stillpath.gcode.containers.opening import open_text, rewriting
-from stillpath.gcode.containers.sniff import Kind
 from stillpath.gcode.errors import GcodeError
-from tests.gcode.container_files import binary, block, blocks, normal
+from tests.gcode.container_files import (
+    binary,
+    block,
+    blocks,
+    normal,
+    refused,
+    rewritten,
+    text_of,
+)
 from tests.gcode.test_meatpack import prints
 
 TEXT = b"; made up\nM107\nG28\nG1 X10 Y5 F6000\nG1 X20.5 E.123\nM117 done now\n"
 EACH = [(compression, encoding) for compression in range(4) for encoding in range(3)]
-
-
-def text_of(file: bytes, folder: Path) -> bytes:
-    path = folder / "any.name"
-    path.write_bytes(file)
-    with open_text(path) as container:
-        assert container.kind is Kind.BGCODE
-        return container.text.read()
-
-
-def rewritten(file: bytes, text: bytes, folder: Path) -> bytes:
-    source, target = folder / "in", folder / "out"
-    source.write_bytes(file)
-    with open_text(source) as container, rewriting(container, target, name=target) as made:
-        made.write(text)
-    return target.read_bytes()
-
-
-def refused(file: bytes, folder: Path, *words: str) -> None:
-    with pytest.raises(GcodeError) as caught:
-        text_of(file, folder)
-    for word in words:
-        assert word in str(caught.value)
 
 
 @pytest.mark.parametrize("checked", [True, False])
@@ -111,7 +95,8 @@ def test_a_damaged_block_is_named(tmp_path: Path):
     for number, (*_, raw) in enumerate(blocks(good), start=1):
         damaged = bytearray(good)
         damaged[offset + len(raw) - 5] ^= 1
-        refused(bytes(damaged), tmp_path, f"block {number} (at byte {offset})", "CRC32", "again")
+        words = rf"block {number} \(at byte {offset}\).*CRC32.*again"
+        refused(bytes(damaged), tmp_path, words)
         offset += len(raw)
 
 
@@ -119,9 +104,9 @@ def test_without_checksums_damage_is_still_found(tmp_path: Path):
     head = binary([], checked=False)
     for compression, data in ((1, b"no deflate"), (2, b"\x80"), (3, b"\x00" * 40)):
         packed = struct.pack("<HHIIH", 1, compression, 77, len(data), 0) + data
-        refused(head + packed, tmp_path, "block 6", "damaged")
+        refused(head + packed, tmp_path, "block 6.*damaged")
     torn = block(1, b"\xff\xff\xfb\x0f", parameters=b"\1\0", checked=False)
-    refused(head + torn, tmp_path, "block 6", "MeatPack")
+    refused(head + torn, tmp_path, "block 6.*MeatPack")
 
 
 @pytest.mark.parametrize(
@@ -145,7 +130,8 @@ def test_without_checksums_damage_is_still_found(tmp_path: Path):
     ],
 )
 def test_unknown_and_broken_files(tmp_path: Path, file: bytes, words: list[str]):
-    refused(file, tmp_path, *words)
+    for word in words:
+        refused(file, tmp_path, word)
 
 
 def test_a_cut_off_file_is_told(tmp_path: Path):
@@ -161,7 +147,7 @@ def test_a_cut_off_file_is_told(tmp_path: Path):
 def test_a_bomb_is_defused(tmp_path: Path):
     bomb = zlib.compress(bytes(1 << 25))
     packed = struct.pack("<HHIIH", 1, 1, 1000, len(bomb), 0) + bomb
-    refused(binary([], checked=False) + packed, tmp_path, "block 6", "instead of 1000")
+    refused(binary([], checked=False) + packed, tmp_path, "block 6.*instead of 1000")
     data = b"G28\n" * (1 << 20)
     many = block(1, data, compression=1, checked=False) * 20
     refused(binary([], checked=False) + many, tmp_path, "unpacks to more than 64 MiB")

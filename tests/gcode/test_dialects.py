@@ -61,15 +61,7 @@ CASES = {
     # text: where the machine is afterwards (x y z e), per firmware
     "exponents": (
         "M83\nG1 X1e-1 F600\n",
-        {
-            "klipper": (1, 0, 0, -1),
-            **same(FAMILY, 1, 0, 0, 0),
-            "reprapfirmware": (0.1, 0, 0, 0),
-        },
-    ),
-    "exponents in capitals": (
-        "M83\nG1 X1E2 F600\n",
-        {**same(("klipper", *FAMILY), 1, 0, 0, 2), "reprapfirmware": (100, 0, 0, 0)},
+        {"klipper": (1, 0, 0, -1), **same(FAMILY, 1, 0, 0, 0), "reprapfirmware": (0.1, 0, 0, 0)},
     ),
     "G90 after M83": (
         "M83\nG90\nG1 X1 E1 F600\nG1 X2 E1\n",
@@ -176,26 +168,15 @@ CASES = {
         "g1 x5 f600 (Y9)\nX6\nG80\nX7\n",
         {"marlin-loose": (6, 0, 0, 0), "marlin": (0, 0, 0, 0)},
     ),
-    "blanks and subcodes": (
-        "G  1 X5 F600\nG1.5 X6\n",
-        same(FAMILY, 6, 0, 0, 0),
-    ),
-    "comments in brackets": ("G1 X5 F600 ;(Y7)\n", same(ALL, 5, 0, 0, 0)),
+    "blanks and subcodes": ("G  1 X5 F600\nG1.5 X6\n", same(FAMILY, 6, 0, 0, 0)),
     "G10 with a tool": ("G10 P0 S200\nG1 X1 F600\n", {"reprapfirmware": (1, 0, 0, 0)}),
     "modes saved": ("M120\nG91\nM121\nG1 X5 F600\nG1 X6\n", {"reprapfirmware": (6, 0, 0, 0)}),
     "CNC mode": ("M453\nG1 X5 (out) Y2 F600\nX7\n", {"reprapfirmware": (7, 2, 0, 0)}),
-    "quoted text": (
-        'M117 "G1 X9"\nM118 P0 S"G1 X9"\nG1 X1 F600\n',
-        {"reprapfirmware": (1, 0, 0, 0)},
-    ),
     "a command after quoted text": (
         'M117 "G1 X9" G1 X1 F600\nM117 G1 X9 "G1 X9"\n',
         {"reprapfirmware": (1, 0, 0, 0)},
     ),
-    "NUL ends what is read": (
-        "G1 X5\0 Y3 F600\nG1\0\0X7\n\0G1 Z1\n",
-        same(FAMILY, 5, 0, 0, 0),
-    ),
+    "NUL ends what is read": ("G1 X5\0 Y3 F600\nG1\0\0X7\n\0G1 Z1\n", same(FAMILY, 5, 0, 0, 0)),
     "NUL ends a line": (
         "G1 X5 F600\0 Y3\nG1 X6\0\0G1 Y1\n\0\0\n\0G1 Z1\n",
         {"reprapfirmware": (6, 1, 1, 0)},
@@ -215,9 +196,6 @@ def test_where_it_ends(case: str, name: str, read) -> None:
 @pytest.mark.parametrize(
     ("line", "name", "words"),
     [
-        ("G20", "klipper", "inches"),
-        ("G2 X5 R9", "klipper", "R"),
-        ("G1 X F600", "klipper", "not a number"),
         ("G1 X F600", "reprapfirmware", "not a number"),
         ("G1 X10 F600\nG2 X0 R4", "reprapfirmware", "too short"),
         ("G2 I5 R0", "reprapfirmware", "where it begins"),
@@ -342,9 +320,7 @@ CLASSES = {
     "M572 S0.03": {"prusa": EventKind.STOP},
     "M74 W150": {"prusa": EventKind.SHAPER},
     "M900 K0.05": {
-        "marlin": EventKind.STOP,
-        "prusa": EventKind.STOP,
-        "bambu": EventKind.STOP,
+        **dict.fromkeys(("marlin", "prusa", "bambu"), EventKind.STOP),
         "klipper": EventKind.HARMLESS,
     },
     "M204.2 K0.5": {"bambu": EventKind.UNKNOWN},
@@ -360,55 +336,17 @@ CLASSES = {
         "bambu": EventKind.UNKNOWN,
         "reprapfirmware": EventKind.UNKNOWN,  # sys/M1234.g may be there
     },
-    "EXCLUDE_OBJECT_START NAME=a": {
-        "marlin": EventKind.HARMLESS,
-        "reprapfirmware": EventKind.HARMLESS,
-    },
+    "EXCLUDE_OBJECT_START NAME=a": dict.fromkeys(("marlin", "reprapfirmware"), EventKind.HARMLESS),
     **{
         line: {"marlin": EventKind.UNKNOWN}
-        for line in (
-            "M23 other.gco",
-            "M26 S0",
-            "M111 S8",
-            "M306 T",
-            "M350 X16",
-            "M401",
-            "M402",
-            "M425 F1",
-            "M493 S1",
-            "M494 X0.05",
-            "M495 Y F10 T100 S1",
-            "M495 X S",
-            "M915",
-            "M1000",
-            "M102 S10",
-            "M217 Q",
-            "M28 log.gco",
-        )
+        for line in ("M23 other.gco", "M401", "M493 S1", "M495 X S", "M1000", "M28 log.gco")
     },
-    **{
-        line: {"prusa": EventKind.UNKNOWN}
-        for line in ("P0 S1 L2 D0", "M958 X1", "M1959", "M1977", "M9150", "G65", "G426", "M970 X1")
-    },
+    **{line: {"prusa": EventKind.UNKNOWN} for line in ("P0 S1 L2 D0", "M958 X1", "M9150", "G65")},
     **{line: {"marlin-stock": EventKind.UNKNOWN} for line in ("G20", "G18", "G54", "G5 X1", "G60")},
     **{line: {"marlin-stock": EventKind.HARMLESS} for line in ("G17", "G80", "g1 X5")},
     **{
         line: {"reprapfirmware": EventKind.UNKNOWN}
-        for line in (
-            "T-1",
-            "T R1",
-            "M109 S200",
-            "M401",
-            "M569 P0 S0",
-            "M673",
-            "M24",
-            'M291 P"jog" X1',
-            "M376 H5",
-            "M582 T2",
-            "M957",
-            "G10 L1 P0 X1",
-            "M28 a.g",
-        )
+        for line in ("T-1", "T R1", "M109 S200", "M24", "G10 L1 P0 X1", "M28 a.g")
     },
     **{
         line: {"reprapfirmware": EventKind.STOP}
@@ -448,15 +386,8 @@ def test_meta_commands_are_barriers(read) -> None:
     )
     assert block.moves.end_mm[:, 0].tolist() == [1, 2, 3]
     assert block.moves.known.tolist() == [7, 0, 7]
-    assert block.events.kind.tolist() == [
-        EventKind.UNKNOWN,
-        EventKind.UNKNOWN,
-        EventKind.UNKNOWN,
-        EventKind.HARMLESS,
-        EventKind.HARMLESS,
-        EventKind.UNKNOWN,
-        EventKind.UNKNOWN,
-    ]
+    unknown, harmless = EventKind.UNKNOWN, EventKind.HARMLESS
+    assert block.events.kind.tolist() == [*3 * [unknown], *2 * [harmless], *2 * [unknown]]
     assert any("conditional" in text for text in interpreter.warnings)
     assert any("expression" in text for text in interpreter.warnings)
 

@@ -12,14 +12,9 @@ from hypothesis import strategies as st
 
 from stillpath.gcode.firmware._encoding_kernels import lay_out
 from stillpath.gcode.firmware._writing_kernels import format_moves
-from stillpath.gcode.firmware.klipper import encoder as encoder_module
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.pieces import Piece
-from stillpath.gcode.plan import plan_moves
-from stillpath.gcode.segments import ErrorFilter, fit_segments
-from stillpath.gcode.timeline import build_timeline, group_rows
 from stillpath.models.machine import Machine
-from stillpath.models.plants import plant_set
 from stillpath.models.store import load_machine
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.pipeline.options import Options
@@ -59,11 +54,7 @@ def made(work: PieceCompensator, piece: Piece) -> CompensatedPiece:
 
 
 def test_reversals_in_a_row_are_on_time(machine: Machine) -> None:
-    """A thin wall filled to and fro, by motors that can do little more than the file asks.
-
-    A segment before a reversal cannot be left faster than the reversal is entered. Segments that
-    were asked for more made the others miss their times, and the whole piece stayed as sliced.
-    """
+    """A thin wall filled to and fro, by motors that can do little more than the file asks."""
     zigzag = "".join(
         f"G1 X{60 + 0.45 * k + 2.2 * (k % 2):.2f} Y{50 + 2.2 * (k % 2)} E.08 F6000\n"
         for k in range(1, 200)
@@ -111,43 +102,6 @@ def test_rests_pass_as_they_came(machine: Machine, work: PieceCompensator, name:
     assert len(own) == 0
     assert np.all(np.diff(encoded.start_s) > 0)
     assert np.all(encoded.feedrate_mm_min[encoded.row < 0] > 0)
-
-
-@pytest.mark.parametrize("name", sorted(BODIES))
-def test_law_of_losses_is_klippers(
-    machine: Machine, work: PieceCompensator, name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """What the planner makes of the first feedrates leaves little to correct."""
-    piece = pieces_of(HEAD + BODIES[name], machine)[1]
-    corrected = made(work, piece).encoded
-    monkeypatch.setattr(encoder_module, "_PASSES", 1)
-    first = made(work, piece).encoded.feedrate_mm_min
-    assert np.mean(np.abs(first - corrected.feedrate_mm_min) <= 0.02 * first) > 0.9
-
-
-def test_rest_durations_are_klippers(machine: Machine) -> None:
-    """A retraction of .8 mm at 35 mm/s and 5000 mm/s2 takes .8 / 35 + 35 / 5000 s."""
-    piece = pieces_of(HEAD + BODIES["retraction"], machine)[1]
-    encoder = adapter(machine).encoder()
-    groups = group_rows(piece.phases)
-    rest_s = encoder.rest_durations(piece, groups)
-    accel = machine.firmware.extruder.max_extrude_only_accel_mm_s2
-    assert rest_s[1] == pytest.approx(0.8 / 35 + 35 / accel, abs=1e-9)
-
-
-def test_plain_path_survives(machine: Machine) -> None:
-    """Without compensation the encoded motion is the plan, within the fit's tolerance."""
-    piece = pieces_of(HEAD + BODIES["hop and retraction"], machine)[1]
-    encoder = adapter(machine).encoder()
-    groups = group_rows(piece.phases)
-    timeline = build_timeline(piece.phases, groups, encoder.rest_durations(piece, groups), 1e-3)
-    plants = [plant_set(machine.axes[a], 1e-3).nominal for a in ("x", "y")]
-    segments = fit_segments(timeline, timeline.position_mm, 5e-3, ErrorFilter(plants))
-    encoded = encoder.encode(piece, timeline, segments)
-    path_mm, moving = timeline.position_mm, timeline.moving
-    command = CompensatedPiece(timeline, path_mm, moving, segments, encoded, 0.0, 0.0)
-    assert np.mean(deviation(command, encoded.phases) < 7e-3) > 0.98
-    assert np.max(deviation(command, encoded.phases)) < 60e-3
 
 
 # Twins
@@ -291,7 +245,3 @@ def test_stream_limits_are_the_machines(machine: Machine) -> None:
     # 27 mm/s at a small angle, of the 45 that a motor's speed may step by within a ms.
     corner = pytest.approx(27.0 / 1.8203, abs=0.01)
     assert stream.as_row() == (diagonal, 20_000.0, corner, 0.0)
-    piece = pieces_of(HEAD + BODIES["corners"], machine)[1]
-    moves = piece.moves
-    phases = plan_moves(moves, piece.limits, machine)
-    assert len(phases) == len(moves)

@@ -4,7 +4,6 @@ import re
 from itertools import pairwise
 
 import numpy as np
-import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
@@ -133,15 +132,6 @@ def test_python_reads_as_the_kernel_does(golden_machine: Machine, data: bytes) -
         np.testing.assert_array_equal(
             column(fast_blocks, "moves", name), column(slow_blocks, "moves", name)
         )
-
-
-@pytest.mark.parametrize("count", [300, 3000])
-def test_tables_grow(golden_machine: Machine, count: int) -> None:
-    text = "G28\nG91\n" + "".join(f"M204 S{1000 + k}\nG1 X.001 F{1000 + k}\n" for k in range(count))
-    blocks = blocks_of(text.encode(), golden_machine)
-    moves, last = blocks[-1].moves, blocks[-1]
-    assert len({limit.accel_mm_s2 for limit in last.limits}) == count + 1
-    assert last.limits[moves.limits_id[-1]].accel_mm_s2 == 999 + count
 
 
 def test_long_arcs_and_many_lines(golden_machine: Machine) -> None:

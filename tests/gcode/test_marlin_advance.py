@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -20,70 +19,12 @@ from stillpath.models.firmware import Marlin
 from stillpath.models.firmware.marlin import PerAxis
 from stillpath.models.machine import CommandLimits, Machine
 from stillpath.models.store import load_machine
-from stillpath.pipeline.measuring.reference_shaper import BestShaper
-from stillpath.pipeline.options import Options
-from stillpath.pipeline.piece_compensator import CompensatedPiece, PieceCompensator, Unfit
-from tests.gcode.cutting import HEAD, MARLIN_PLANNER, pieces_of
+from stillpath.pipeline.piece_compensator import Unfit
+from tests.gcode.cutting import HEAD, MARLIN_PLANNER, compensated, pieces_of
 
 K_S = 0.05
-PER_MM, E_PER_MM, FED = 80.0, 400.0, 0.033
+PER_MM = 80.0
 PRINTED = "G1 X90 E2 F6000\nG1 X90 Y60 E1\nG1 X20 E3.5 F3000\nG1 Y20 E2\n"
-
-
-# The firmware's own, block by block: a twin of its interrupts
-
-
-def lead_steps(blocks: list[tuple[float, float, float, float]], accel: float, release: str) -> Any:
-    """Extruder steps that it is ahead by at the end of each block.
-
-    Parameters
-    ----------
-    blocks : list of (mm, entry, cruise and exit speed)
-    release : "2.0" (stepper.cpp, `advance_isr`, with a timer of its own) or "2.1" (la_advance_rate,
-        on top of the block's own steps)
-    """
-    lead, leads = 0.0, []
-    rate = K_S * FED * accel * E_PER_MM
-    for length, entry, cruise, leave in blocks:
-        steps = round(length * PER_MM)
-        first, nominal, final = (v * PER_MM for v in (entry, cruise, leave))
-        rising = math.ceil((nominal**2 - first**2) / (2.0 * accel * PER_MM))
-        falling = math.floor((nominal**2 - final**2) / (2.0 * accel * PER_MM))
-        most, least = (K_S * FED * v * E_PER_MM for v in (cruise, leave))
-        now, clock = first, 0.0
-        for done in range(1, steps + 1):
-            wait = 1.0 / now
-            brakes = done > steps - falling
-            grows = not brakes if release == "2.0" else done <= rising + 1
-            if grows and lead < most:
-                more = rate * wait
-                lead += min(more, most - lead) if release == "2.0" else more
-            elif brakes and lead > least:
-                lead -= min(rate * wait, lead - least) if release == "2.0" else rate * wait
-            clock += wait
-            if done <= rising:
-                now = min(first + accel * PER_MM * clock, nominal)
-            elif done >= steps - falling:
-                now = max(math.sqrt(max(now**2 - 2.0 * accel * PER_MM, 0.0)), final)
-            else:
-                now = nominal
-        leads.append(lead)
-    return np.array(leads)
-
-
-@pytest.mark.parametrize("release", ["2.0", "2.1"])
-def test_the_firmwares_own_follows_a_ramp_and_not_a_stream(release: str) -> None:
-    full = K_S * FED * 100.0 * E_PER_MM
-    ramp = [(5.0, 2.0, 100.0, 100.0), (5.0, 100.0, 100.0, 2.0)]
-    leads = lead_steps(ramp, 3000.0, release)
-    assert leads[0] == pytest.approx(full, rel=0.05)
-    assert leads[1] == pytest.approx(0.02 * full, abs=3.0)
-    # Under limits far above, 5 mm/s slower every .2 mm: no block has a step of braking.
-    speeds = np.arange(100.0, 4.0, -5.0)
-    stream = [(0.2, 5.0, 100.0, 100.0)]
-    stream += [(0.2, v, v, max(v - 5.0, 5.0)) for v in speeds]
-    leads = lead_steps(stream, 300_000.0, release)
-    assert leads[-1] >= full
 
 
 # The filament
@@ -143,15 +84,8 @@ def machine_of(**changes: Any) -> Machine:
     return load_machine("ender3").model_copy(update={"firmware": own})
 
 
-def compensated(machine: Machine) -> CompensatedPiece:
-    piece = pieces_of(HEAD + PRINTED, machine)[1]
-    work = PieceCompensator(machine, Options(), BestShaper("mzv", 40.0, 40.0, 0.1, 0.0, 0.0))
-    work.compensator.reset(piece.moves.start_mm[0, :2])
-    return work.compensate(piece)
-
-
 def test_the_filament_holds_what_the_firmware_has_switched_off() -> None:
-    made = compensated(machine_of(linear_advance_k_s=K_S))
+    _, made = compensated(HEAD + PRINTED, machine_of(linear_advance_k_s=K_S))
     t = made.timeline.dt_s * np.arange(made.command_mm.shape[1])
     # From rest the first step takes 1/120 s, and everything is later by that.
     delay_s = made.encoded.group_start_s[0] - made.timeline.start_s[0]
@@ -165,7 +99,7 @@ def test_the_filament_holds_what_the_firmware_has_switched_off() -> None:
     fed = np.diff(made.encoded.position[:, 3], prepend=made.encoded.begin[3])[:-1] * 400e-6
     assert np.max(np.abs(fed - np.round(fed))) < 1e-3
     # It is given back, and places and times are those of a stream without it.
-    plain = compensated(machine_of(linear_advance_k_s=0.0))
+    _, plain = compensated(HEAD + PRINTED, machine_of(linear_advance_k_s=0.0))
     assert made.encoded.position[-1, 3] == plain.encoded.position[-1, 3]
     gap = executed[:2] - made.command_mm[:2]
     assert np.quantile(np.hypot(*gap)[made.extruding], 0.99) <= 5e-3 + 1.0 / PER_MM
@@ -174,8 +108,8 @@ def test_the_filament_holds_what_the_firmware_has_switched_off() -> None:
 def test_where_nobody_says_that_there_is_advance_nothing_is_slower_for_it() -> None:
     # K .2 s, .1 of E per mm, 2000 mm/s2: 40 mm/s of the extruder; its jerk is 15.5 mm/s.
     with pytest.raises(Unfit, match=r"M900 K0\.2.*15\.5 mm/s.*linear_advance true"):
-        compensated(machine_of(linear_advance=None, linear_advance_k_s=0.2))
-    made = compensated(machine_of(linear_advance=None, linear_advance_k_s=0.07))
+        compensated(HEAD + PRINTED, machine_of(linear_advance=None, linear_advance_k_s=0.2))
+    _, made = compensated(HEAD + PRINTED, machine_of(linear_advance=None, linear_advance_k_s=0.07))
     assert made.encoded.limits[-1].advance_in_filament == 1.0  # type: ignore[attr-defined]
 
 

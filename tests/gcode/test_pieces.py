@@ -124,10 +124,6 @@ def test_positions_unknown_at_the_start(machine: Machine) -> None:
     assert [p.text for p in pieces] == [b"G1 X50\nG1 Y50\n"]
 
 
-def test_relative_moves_keep_unknown(machine: Machine) -> None:
-    assert pieces_of(b"G91\nG1 X20 Y20\nG1 X5\n", machine) == []
-
-
 def test_long_runs_are_cut_at_rests(machine: Machine) -> None:
     lines = [*HEAD.splitlines(), "G1 X120 Y100 F6000"]
     for _ in range(40):
@@ -154,24 +150,6 @@ def test_vase_is_forced_to_stop(machine: Machine) -> None:
     assert len(long) > 1
     # Cut in mid motion, but for that whole; each half is planned to stop (see `check`).
     assert b"".join(piece.text for piece in long) in data
-
-
-def test_longest_is_kept(machine: Machine) -> None:
-    lines = [*HEAD.splitlines(), "G1 X120 Y100 F6000"]
-    for _ in range(4):
-        lines += polygon(30, 20)
-    items = cut("\n".join(lines).encode(), machine, longest_s=2.0)
-    assert text_of(items) == "\n".join(lines).encode()
-    for item in items:
-        if isinstance(item, Piece):
-            p = item.phases
-            assert (p.t_s + p.accel_s + p.cruise_s + p.decel_s)[-1] - p.t_s[0] <= 2 + 1e-6
-
-
-def test_one_move_longer_than_a_piece(machine: Machine) -> None:
-    text = HEAD + "G1 X20 F30\nG1 X40 F3000\nG1 X41\n"
-    items = cut(text.encode(), machine)
-    assert text_of(items) == text.encode()
 
 
 @pytest.mark.parametrize(

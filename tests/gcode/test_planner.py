@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from stillpath.gcode.errors import GcodeError
+from stillpath.gcode.firmware.encoding import as_moves
 from stillpath.gcode.firmware.klipper.limits import KlipperLimits
 from stillpath.gcode.firmware.klipper.planner import Planner
 from stillpath.gcode.firmware.planning import join_phases
@@ -25,29 +26,8 @@ LIMITS = [KlipperLimits(500.0, 5000.0, 5.0, 0.5), KlipperLimits(80.0, 1000.0, 8.
 def moves_of(
     steps: NDArray[np.float64], speed: NDArray[np.float64], limits_id: NDArray[np.int64]
 ) -> Moves:
-    n = len(steps)
     points = np.vstack((np.zeros(4), np.cumsum(steps, axis=0)))
-    whole = np.zeros(n, np.int64)
-    small = np.zeros(n, np.int32)
-    return Moves(
-        start_mm=points[:-1],
-        end_mm=points[1:],
-        speed_mm_s=speed,
-        limits_id=limits_id.astype(np.int32),
-        modal_id=small,
-        known=np.full(n, 7, np.uint8),
-        line=np.arange(1, n + 1),
-        byte_start=whole,
-        byte_end=whole,
-        layer=small,
-        feature=small,
-        object_id=small,
-        tool=small,
-    )
-
-
-def part_of(moves: Moves, a: int, b: int) -> Moves:
-    return rows_of(moves, slice(a, b))
+    return as_moves(points[:-1], points[1:], speed, limits_id.astype(np.int32))
 
 
 def plan_moves(moves: Moves, limits: list[KlipperLimits], firmware: Klipper) -> Phases:
@@ -130,13 +110,6 @@ def test_move_without_displacement_has_no_phase() -> None:
     plan = plan_moves(straight(5.0, 0.0, 5.0), LIMITS, FIRMWARE)
     assert plan.move_index.tolist() == [0, 2]
     assert plan.start_mm_s[1] == pytest.approx(100.0)
-
-
-def test_nothing() -> None:
-    planner = Planner(FIRMWARE)
-    assert len(planner.flush()) == 0
-    assert len(planner.stop(1.0)) == 0
-    assert planner.time_s == 0
 
 
 # The rules once more, in plain Python, from the description of the firmware
@@ -251,7 +224,7 @@ def test_streaming_is_one_shot(moves: Moves, cuts: list[int]) -> None:
     whole = plan_moves(moves, LIMITS, TOLERANT)
     planner = Planner(TOLERANT)
     bounds = [0, *sorted(min(cut, len(moves)) for cut in cuts), len(moves)]
-    parts = [planner.push_moves(part_of(moves, a, b), LIMITS) for a, b in pairwise(bounds)]
+    parts = [planner.push_moves(rows_of(moves, slice(a, b)), LIMITS) for a, b in pairwise(bounds)]
     plan = join_phases([*parts, planner.flush()])
     for name in Phases.__dataclass_fields__:
         np.testing.assert_array_equal(getattr(plan, name), getattr(whole, name))
@@ -305,7 +278,7 @@ def test_long_stream_settles_as_it_goes() -> None:
     waiting = 0
     settled = 0
     for a in range(0, len(moves), 500):
-        settled += len(planner.push_moves(part_of(moves, a, a + 500), LIMITS))
+        settled += len(planner.push_moves(rows_of(moves, slice(a, a + 500)), LIMITS))
         waiting = max(waiting, a + 500 - settled)
     assert waiting < 600
     assert settled + len(planner.flush()) == len(moves)

@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware._encoding_kernels import MoveLimits
 from stillpath.gcode.firmware.encoding import as_moves
 from stillpath.gcode.firmware.planning import join_phases
@@ -21,7 +20,6 @@ from stillpath.gcode.firmware.reprapfirmware.limits import RepRapLimits
 from stillpath.gcode.firmware.reprapfirmware.planner import RepRapPlanner, on_steps
 from stillpath.gcode.firmware.reprapfirmware.stream_commands import RepRapStreamCommands
 from stillpath.gcode.interpreter import Interpreter
-from stillpath.gcode.plan import plan_moves
 from stillpath.gcode.sampler import sample_phases
 from stillpath.gcode.types import EventKind
 from stillpath.models.firmware import RepRapFirmware
@@ -31,12 +29,11 @@ from stillpath.models.store import load_machine
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.piece_compensator import (
-    CompensatedPiece,
     PieceCompensator,
     Unfit,
     deviation,
 )
-from tests.gcode.cutting import HEAD, pieces_of
+from tests.gcode.cutting import HEAD, compensated, pieces_of
 from tests.gcode.test_encoder import BODIES
 
 ADVANCE_S = 0.04
@@ -74,13 +71,6 @@ def machine_of(
     return load_machine("ender3").model_copy(update=changes)
 
 
-def compensated(machine: Machine, body: str) -> CompensatedPiece:
-    piece = pieces_of(HEAD + body, machine)[1]
-    work = PieceCompensator(machine, Options(), BestShaper("mzv", 40.0, 40.0, 0.1, 0.0, 0.0))
-    work.compensator.reset(piece.moves.start_mm[0, :2])
-    return work.compensate(piece)
-
-
 @pytest.mark.parametrize("name", sorted(BODIES))
 @pytest.mark.parametrize(
     ("steps_per_mm", "kinematics"), [(80.0, "cartesian"), (160.0, "cartesian"), (160.0, "corexy")]
@@ -88,7 +78,9 @@ def compensated(machine: Machine, body: str) -> CompensatedPiece:
 def test_executed_is_the_command(
     name: str, steps_per_mm: float, kinematics: Literal["cartesian", "corexy"]
 ) -> None:
-    made = compensated(machine_of(firmware(steps_per_mm), kinematics=kinematics), BODIES[name])
+    _, made = compensated(
+        HEAD + BODIES[name], machine_of(firmware(steps_per_mm), kinematics=kinematics)
+    )
     gap = deviation(made, made.encoded.phases)
     step = 1.0 / steps_per_mm
     tolerance = 1e-3 * Options().tolerance_um
@@ -104,7 +96,7 @@ def test_executed_is_the_command(
 @pytest.mark.parametrize("kinematics", ["cartesian", "corexy"])
 def test_segments_end_on_whole_steps(kinematics: Literal["cartesian", "corexy"]) -> None:
     machine = machine_of(firmware(), kinematics=kinematics)
-    made = compensated(machine, BODIES["corners"])
+    _, made = compensated(HEAD + BODIES["corners"], machine)
     places = made.encoded.position[:-1, :3] * 1e-6
     assert isinstance(machine.firmware, RepRapFirmware)
     stands = on_steps(places, machine.firmware, kinematics)
@@ -130,12 +122,9 @@ def vase(turns: int) -> str:
 
 @pytest.mark.parametrize("body", [zigzag(300), vase(5)], ids=["infill", "vase"])
 def test_long_stretches_stay_in_time(body: str) -> None:
-    """Thousands of segments, foreseen to the clock: their roundings do not add up.
-
-    A climb on steps of Z would be flat and then too steep, and slowed at every such corner.
-    """
+    """Thousands of segments, foreseen to the clock: their roundings do not add up."""
     machine = machine_of(firmware(160.0))
-    made = compensated(machine, body)
+    _, made = compensated(HEAD + body, machine)
     encoded = made.encoded
     assert len(encoded.position) > 1000
     gap = deviation(made, encoded.phases)
@@ -152,15 +141,15 @@ def test_slow_lines_of_nearly_the_same_speed_stay_in_time(slower: int) -> None:
     """The firmware cuts off peaks of speed that do not stand out by a tenth of it."""
     lines = [(50.0 + 0.9 * i, 50.0 + 0.02 * i * i, 300 - slower * (i % 2)) for i in range(1, 60)]
     body = "".join(f"G1 X{x:.2f} Y{y:.2f} E.03 F{f}\n" for x, y, f in lines)
-    made = compensated(machine_of(firmware(160.0)), "M204 P6000\n" + body)
+    _, made = compensated(HEAD + "M204 P6000\n" + body, machine_of(firmware(160.0)))
     gap = deviation(made, made.encoded.phases)
     assert np.max(gap[made.extruding]) <= 0.02
 
 
 def test_filament_holds_the_advance_that_the_firmware_has_switched_off() -> None:
     machine = machine_of(firmware(), advance_s=ADVANCE_S)
-    made = compensated(machine, ADVANCED)
-    plain = compensated(machine_of(firmware()), ADVANCED)
+    _, made = compensated(HEAD + ADVANCED, machine)
+    _, plain = compensated(HEAD + ADVANCED, machine_of(firmware()))
     phases = made.encoded.phases
     t = made.timeline.dt_s * np.arange(made.command_mm.shape[1])
     executed, _ = sample_phases(phases, t)
@@ -182,7 +171,7 @@ def test_rests_run_under_the_files_own_limits() -> None:
     """A retraction of .8 mm at 35 mm/s and 5000 mm/s2 takes .8 / 35 + 35 / 5000 s from rest."""
     machine = machine_of(firmware())
     piece = pieces_of(HEAD + BODIES["retraction"], machine)[1]
-    made = compensated(machine, BODIES["retraction"])
+    _, made = compensated(HEAD + BODIES["retraction"], machine)
     rows = np.flatnonzero(made.encoded.row >= 0)
     phases = made.encoded.phases
     lasts = (phases.lasts_s)[rows]
@@ -208,11 +197,11 @@ def test_a_queue_that_cannot_be_kept_filled_is_refused() -> None:
 
 def test_a_dense_stream_is_thinned_out_for_a_short_queue() -> None:
     # 7 moves must last 27 ms: none of them may be the 1 ms that a corner would like.
-    short = compensated(machine_of(firmware(ring_length=16)), BODIES["corners"])
+    _, short = compensated(HEAD + BODIES["corners"], machine_of(firmware(ring_length=16)))
     phases = short.encoded.phases
     total = np.cumsum(np.append(0.0, phases.lasts_s))
     assert np.min(total[7:] - total[:-7]) >= 27e-3
-    long = compensated(machine_of(firmware(ring_length=100)), BODIES["corners"])
+    _, long = compensated(HEAD + BODIES["corners"], machine_of(firmware(ring_length=100)))
     assert len(long.encoded.row) > len(short.encoded.row)
     assert np.max(np.diff(phases.t_s) - np.diff(total)[:-1]) < 1e-9
 
@@ -372,16 +361,3 @@ def test_crowded_ends_are_kept_apart(lasts: list[float], least_s: float) -> None
             last = begin_s[k]
         assert keep[k] == (final[k] or end_s[k] - last >= least_s - 1e-9)
         last = end_s[k] if keep[k] else last
-
-
-def test_plan_moves_takes_the_kit() -> None:
-    machine = machine_of(firmware())
-    moves = as_moves(
-        np.zeros((1, 4)), np.array([[10.0, 0.0, 0.0, 0.0]]), np.array([50.0]), np.zeros(1, np.int32)
-    )
-    phases = plan_moves(moves, [adapter(machine).initial_limits()], machine)
-    # 50 mm/s at 5000 mm/s2: 10 ms and .25 mm at both ends.
-    assert phases.cruise_s[0] == pytest.approx(9.5 / 50.0, abs=2e-6)
-    broken = replace(adapter(machine).initial_limits(), accel_x_mm_s2=0.0)
-    with pytest.raises(GcodeError, match="above 0"):
-        plan_moves(moves, [broken], machine)

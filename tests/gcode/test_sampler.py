@@ -82,19 +82,6 @@ def test_distances(plan: Phases, stretches: list[tuple[int, float, float]], seed
     np.testing.assert_allclose(found, np.hypot(*(position[:2] - points)), rtol=0, atol=1e-9)
 
 
-def test_ends_and_stand(plan: Phases) -> None:
-    end = plan.t_s[-1] + plan.accel_s[-1] + plan.cruise_s[-1] + plan.decel_s[-1]
-    position, row = sample_phases(plan, (-1.0, end + 2.0, 2))
-    assert position[:, 0].tolist() == [0, 0, 0, 0]
-    assert position[:, 1] == pytest.approx([0, 10, 1, 1], abs=1e-9)
-    assert row.tolist() == [0, len(plan) - 1]
-    stand = plan.t_s[2] - np.array([0.03, 0.02, 0.01])
-    position, row = sample_phases(plan, stand)
-    assert position[:, 0] == pytest.approx([30, 20, 0, 1])
-    assert np.ptp(position, axis=1) == pytest.approx(np.zeros(4), abs=1e-12)
-    assert row.tolist() == [1, 1, 1]
-
-
 @settings(max_examples=50)
 @given(st.lists(st.integers(0, 200), max_size=8), st.sampled_from([0.0005, 0.004, 0.3]))
 def test_streaming_has_no_gap(plan: Phases, cuts: list[int], dt_s: float) -> None:

@@ -20,16 +20,13 @@ from stillpath.gcode.segments import (
     fit_segments,
 )
 from stillpath.gcode.timeline import Group, Timeline
-from stillpath.models.plants import DiscretePlant, Mode, ModesSpec, discretise
+from stillpath.models.plants import DiscretePlant
+from tests.plants import answer, one_mode
 
 DT_S = 1e-3
 GRID_MM = 1e-3
 SILENT = DiscretePlant(np.zeros((0, 0)), np.zeros(0), np.zeros(0), 1.0, dt_s=DT_S)
 """Answers only at once: there is nothing to shape."""
-
-
-def one_mode(f_hz: float = 45.0, zeta: float = 0.03) -> DiscretePlant:
-    return discretise(ModesSpec(modes=(Mode(f_hz=f_hz, zeta=zeta),)), DT_S)
 
 
 def curvy(seed: int, samples: int, speed_mm_s: float = 80.0) -> np.ndarray:
@@ -89,7 +86,7 @@ def fit(command: np.ndarray, tolerance_mm: float, plant: DiscretePlant = SILENT)
 )
 def test_bounds(seed: int, samples: int, tolerance_um: float, speed: float, shaped: bool) -> None:
     command, tolerance = curvy(seed, samples, speed), 1e-3 * tolerance_um
-    segments = fit(command, tolerance, one_mode() if shaped else SILENT)
+    segments = fit(command, tolerance, one_mode(45.0, 0.03) if shaped else SILENT)
     error = executed(segments, command) - command
     # The funnel is a little loose, and its vertices are rounded.
     spare = LOOSE_SHARE * tolerance + np.sqrt(0.5) * GRID_MM
@@ -101,7 +98,8 @@ def test_bounds(seed: int, samples: int, tolerance_um: float, speed: float, shap
         sideways = direction[0] * error[1] - direction[1] * error[0]
         assert np.sqrt(np.mean(sideways**2)) <= across + spare
     assert np.max(np.abs(error[2])) <= module.Z_TOLERANCE_MM * 1.01
-    assert np.max(np.abs(error[3])) <= module.E_TOLERANCE_MM * 1.01
+    moved = 0.04 * np.max(np.hypot(*error[:2]))
+    assert np.max(np.abs(error[3])) <= module.E_TOLERANCE_MM * 1.01 + moved
 
 
 def test_segments_end_at_marked_samples() -> None:
@@ -124,7 +122,7 @@ def test_ends_grid_and_order(seed: int, samples: int, shaped: bool) -> None:
     command[3, b:] += 0.5  # filament that the rest moves
     line = line_of(command, ((a, b),))
     line.group_start_mm[2, 3] = command[3, b]
-    plant = one_mode() if shaped else SILENT
+    plant = one_mode(45.0, 0.03) if shaped else SILENT
     segments = fit_segments(line, command, 5e-3, ErrorFilter([plant, plant]))
     assert set(segments.group.tolist()) == {0, 2}
     assert np.all(np.diff(segments.end_s) > 0)
@@ -151,24 +149,16 @@ def test_tolerance_pays() -> None:
     assert counts[-1] < 0.5 * counts[0]
 
 
-def response(plant: DiscretePlant, u: np.ndarray) -> np.ndarray:
-    x, y = np.zeros(plant.order), np.empty(len(u))
-    for k, value in enumerate(u):
-        y[k] = plant.c @ x + plant.d * value
-        x = plant.a @ x + plant.b * value
-    return y
-
-
-@pytest.mark.parametrize("f_hz", [26.0, 45.0, 60.0])
+@pytest.mark.parametrize("f_hz", [26.0, 60.0])
 def test_a_machine_responds_less(f_hz: float) -> None:
     """Its resonance counts: where a fit ignores it, the machine responds more."""
-    plant = one_mode(f_hz)
+    plant = one_mode(f_hz, 0.03)
     command = curvy(5, 4000, 120)
     rms = []
     for assumed in (SILENT, plant):
         fitted = fit_segments(line_of(command), command, 5e-3, ErrorFilter([assumed, assumed]))
         error = executed(fitted, command) - command
-        rms.append(np.sqrt(np.mean([response(plant, row) ** 2 for row in error[:2]])))
+        rms.append(np.sqrt(np.mean([answer(plant, row) ** 2 for row in error[:2]])))
     assert rms[1] < 0.9 * rms[0]
 
 
@@ -184,10 +174,17 @@ def twin(command: np.ndarray, tolerance: float, plant: DiscretePlant) -> np.ndar
     inner, counts = hats[1:-1], correlation(plant)
     lag = np.abs(np.subtract.outer(*2 * [np.arange(command.shape[1])]))
     g = np.where(lag < len(counts), counts[np.minimum(lag, len(counts) - 1)], 0.0)
+    shift = np.zeros((2, len(inner)))
     for axis in range(2):
         missed = command[axis] - command[axis, samples] @ hats
-        shift = np.linalg.solve(inner @ g @ inner.T, inner @ g @ missed)
-        ends[:-1, 1 + axis] = command[axis, samples[1:-1]] + shift
+        shift[axis] = np.linalg.solve(inner @ g @ inner.T, inner @ g @ missed)
+        ends[:-1, 1 + axis] = command[axis, samples[1:-1]] + shift[axis]
+    # Filament by the way that an end moves along the path.
+    steps = np.diff(command[:2, samples]).T
+    ways = np.maximum(np.hypot(*steps.T), 1e-9)
+    per_mm = np.diff(np.append(command[3, 0], ends[:, 4])) / ways
+    for i in range(len(inner)):
+        ends[i, 4] += max(0.0, min(per_mm[i : i + 2])) * (shift[:, i] @ steps[i + 1]) / ways[i + 1]
     ends[:-1, 1:3] = GRID_MM * np.round(ends[:-1, 1:3] / GRID_MM)
     return ends
 
@@ -195,9 +192,9 @@ def twin(command: np.ndarray, tolerance: float, plant: DiscretePlant) -> np.ndar
 def correlation(plant: DiscretePlant) -> np.ndarray:
     """How errors count together: that of the machine's response, fading to 0 over 32 samples."""
     pulse = np.append(1.0, np.zeros(3000))
-    answer = response(plant, pulse) + module.BEYOND_MODEL * pulse
+    reply = answer(plant, pulse) + module.BEYOND_MODEL * pulse
     lags = np.arange(32)
-    return np.array([answer[: len(answer) - k] @ answer[k:] for k in lags]) * (1.0 - lags / 32)
+    return np.array([reply[: len(reply) - k] @ reply[k:] for k in lags]) * (1.0 - lags / 32)
 
 
 def twin_ends(command: np.ndarray, tolerance: float) -> np.ndarray:
@@ -249,7 +246,7 @@ def twin_ends(command: np.ndarray, tolerance: float) -> np.ndarray:
 @pytest.mark.parametrize("shaped", [False, True])
 def test_twin(shaped: bool, seed: int, tolerance_um: float) -> None:
     command = curvy(seed, 60, 60)
-    plant = one_mode(zeta=0.1) if shaped else SILENT
+    plant = one_mode(45.0, 0.1) if shaped else SILENT
     segments = fit(command, 1e-3 * tolerance_um, plant)
     expected = twin(command, 1e-3 * tolerance_um, plant)
     np.testing.assert_allclose(segments.end_s, expected[:, 0], atol=1e-9)
@@ -262,7 +259,7 @@ def test_long_and_short_segments_together() -> None:
     command = np.zeros((4, n))
     command[0] = np.interp(np.arange(n), [0, n - 40, n - 1], [0, 100.0, 100.2])
     command[1] = 0.01 * np.sin(np.arange(n) / 3.0) * (np.arange(n) > n - 200)
-    segments = fit(command, 1e-3, one_mode())
+    segments = fit(command, 1e-3, one_mode(45.0, 0.03))
     error = executed(segments, command) - command
     assert segments.end_s[0] > 10.0
     assert len(segments) > 50

@@ -1,7 +1,4 @@
-"""The written file, read as the machine reads it: every original line finds its own state.
-
-Files go through the whole pipeline here: what counts is the text that reaches the printer.
-"""
+"""The written file, read as the machine reads it: every original line finds its own state."""
 
 from __future__ import annotations
 
@@ -123,9 +120,8 @@ def test_limits_are_raised_and_restored(pipeline: Pipeline) -> None:
 
 @pytest.mark.parametrize(
     "line",
-    ["M204 S700", "M204 P700 T900", "SET_VELOCITY_LIMIT ACCEL=700",
-     "SET_VELOCITY_LIMIT SQUARE_CORNER_VELOCITY=3 VELOCITY=90"],
-)  # fmt: skip
+    ["M204 P700 T900", "SET_VELOCITY_LIMIT SQUARE_CORNER_VELOCITY=3 VELOCITY=90"],
+)
 def test_limit_changes_are_held_back(pipeline: Pipeline, line: str) -> None:
     lines = check(pipeline, HEAD + ROUND + f"{line}\n" + TURN + "M400\nG1 X10 F3000\n")
     assert any(x.startswith(f"; stillpath, held back: {line}".encode()) for x in lines)
@@ -133,7 +129,7 @@ def test_limit_changes_are_held_back(pipeline: Pipeline, line: str) -> None:
 
 @pytest.mark.parametrize(
     "change",
-    ["M82\nG92 E0", "M220 S80", "M221 S90", "G92 E0", "G92 E12.5", "G1 F2400"],
+    ["M82\nG92 E0", "M220 S80", "G1 F2400"],
 )
 def test_modes_between_figures(pipeline: Pipeline, change: str) -> None:
     """Changes at a rest, and the file goes on in them."""
@@ -145,26 +141,6 @@ def test_modes_between_figures(pipeline: Pipeline, change: str) -> None:
 def test_relative_files(pipeline: Pipeline) -> None:
     text = HEAD + "G91\nG1 X20 Y3 E1 F3000\nG1 X-4 Y9 E.5\nG1 E-1 F2100\nG1 X9\nG1 E1\n"
     check(pipeline, text + "G1 X-9 Y9 E1\nG1 Z1 F600\nG1 X5 F3000\nM400\nG1 X2 Y2\nG90\nG1 X50\n")
-
-
-def test_absolute_filament(pipeline: Pipeline) -> None:
-    text = HEAD + "M82\nG92 E0\nG1 X90 E1 F3000\nG1 Y90 E2\nG1 E1.2 F2100\nG1 X50 F6000\nG1 E2\n"
-    check(pipeline, text + "G1 Y50 E3 F3000\nM400\nG1 X20 Y20 E4\nG1 E3.2\n")
-
-
-def test_g92_e_in_mid_motion(pipeline: Pipeline) -> None:
-    text = HEAD + "M82\nG92 E0\nG1 X120 Y100 F6000\n"
-    turn, e = [], 0.0
-    for k, line in enumerate(polygon(90, 20)):
-        head, _, tail = line.partition(" E")
-        e += float(tail.split()[0])
-        turn.append(f"{head} E{e:.5f} F3600")
-        if k == 41:
-            turn.append("G92 E0")
-            e = 0.0
-    text += "\n".join(turn) + "\nM400\nG28 X\nG1 X50 Y50 F3000\nG1 E0 F2100\n"
-    original = tagged(text.encode())
-    assert differences(original, pipeline(original), pipeline.machine) == []
 
 
 def test_move_of_no_length_in_mid_motion(pipeline: Pipeline) -> None:
@@ -193,13 +169,6 @@ def test_rest_lines_without_f(pipeline: Pipeline) -> None:
     check(
         pipeline, HEAD + ROUND + "G1 F2100\nG1 E-1\nG1 Z6\n" + ROUND + "G1 F900\nG1 E1\nG1 X9 Y9\n"
     )
-
-
-def test_shaper_unknown_stays_off(pipeline: Pipeline) -> None:
-    written = pipeline(HEAD + ROUND + "G28\nG1 X5 Y5\n")
-    assert written.count(b"SET_INPUT_SHAPER") == 1
-    assert pipeline.result is not None
-    assert any("shaper" in warning for warning in pipeline.result.warnings)
 
 
 def test_shaper_of_the_machine_is_restored(pipeline: Pipeline, machine: Machine) -> None:
@@ -284,6 +253,7 @@ def test_a_file_that_ends_in_a_stream_gives_the_printer_back(pipeline: Pipeline)
     limits = [line for line in lines if line.startswith(b"SET_VELOCITY_LIMIT")]
     assert b"ACCEL=5000 " in limits[-1]
     assert lines[-2] == b"; stillpath: stream off"
+    assert sum(line.startswith(b"SET_INPUT_SHAPER") for line in lines) == 1
     assert pipeline.result is not None
     assert any("shaper" in warning for warning in pipeline.result.warnings)
 
@@ -297,7 +267,7 @@ def test_after_homing_the_machine_stands_still(pipeline: Pipeline) -> None:
     assert ours.contour_max_um < 0.3 * sliced.contour_max_um
 
 
-@pytest.mark.parametrize("length", ["0.0005", "0.001", "0.02"])
+@pytest.mark.parametrize("length", ["0.0005", "0.02"])
 def test_hardly_a_move_between_two_rests(pipeline: Pipeline, length: str) -> None:
     tiny = f"G1 E-1 F2100\nG1 X{120 + float(length):.4f} F6000\nG1 E1 F2100\nG1 X130 F6000\n"
     written = pipeline(HEAD + ROUND + tiny + "M400\nG1 X130.001\nM400\n")
@@ -305,28 +275,13 @@ def test_hardly_a_move_between_two_rests(pipeline: Pipeline, length: str) -> Non
 
 
 def test_stamps(pipeline: Pipeline, machine: Machine) -> None:
-    lines = pipeline(HEAD + ROUND).splitlines()
+    lines = pipeline(HEAD + ROUND + "M84").splitlines()
+    assert b"M84" in lines
     assert lines[0].startswith(b"; Processed by stillpath ")
     assert lines[-1] == lines[0]
     assert f"model={machine.revision}".encode() in lines[0]
     kinds = [s.kind for s in states(b"\n".join(lines), machine)]
     assert kinds[0] == kinds[-1] == EventKind.STAMP
-
-
-def test_missing_last_newline(pipeline: Pipeline) -> None:
-    for end in ("", "\n"):
-        lines = pipeline(HEAD + ROUND + "M84" + end).splitlines()
-        assert b"M84" in lines
-        assert lines[-1].startswith(b"; Processed by stillpath")
-
-
-def test_streams_are_closed_before_foreign_lines(pipeline: Pipeline) -> None:
-    text = HEAD + ROUND + "MY_MACRO A=1\nG1 X50 Y50\n" + ROUND + "PAUSE\nM84\n"
-    on = False
-    for line in pipeline(text).splitlines():
-        on = on or line == b"; stillpath: stream on"
-        on = on and not line.startswith(OFF)
-        assert not (on and line.startswith((b"MY_MACRO", b"PAUSE")))
 
 
 @pytest.mark.parametrize(

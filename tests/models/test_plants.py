@@ -158,8 +158,9 @@ def test_dc_gain_rule() -> None:
     assert TfSpec(num=(0.11,), den=(1, -0.9), dt_s=1e-3).notes[0].startswith("warning")
     with pytest.raises(ValidationError, match=r"DC gain 1\.2"):
         TfSpec(num=(0.12,), den=(1, -0.9), dt_s=1e-3)
-    scaled = discretise(TfSpec(num=(0.11,), den=(1, -0.9), dt_s=1e-3), 1e-3)
-    assert scaled.frequency_response(0.0)[0] == pytest.approx(1.0, abs=1e-12)
+    spec = TfSpec(num=(0.11,), den=(1, -0.9), dt_s=1e-3)
+    assert discretise(spec, 1e-3).frequency_response(0.0)[0] == pytest.approx(1.0, abs=1e-12)
+    assert frequency_response(spec, [0.0])[0] == pytest.approx(1.0, abs=1e-12)
 
 
 @pytest.mark.parametrize(

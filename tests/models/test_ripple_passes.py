@@ -84,11 +84,6 @@ def test_fast_waves_are_not_flattened() -> None:
     assert only.phase_deg == pytest.approx(np.degrees(0.7), abs=1.0)
 
 
-def test_without_homing_it_is_refused() -> None:
-    with pytest.raises(ModelError, match="homed"):
-        learn_machine_ripple(machine(), "x", [read_pass(log(""), "pass.csv")], BASIS)
-
-
 @pytest.mark.parametrize(("motor", "sign"), [("a", 1.0), ("b", -1.0)])
 def test_a_motor_of_corexy_is_learnt_along_a_diagonal(motor: RippleAxis, sign: float) -> None:
     """X and Y vibrate differently; the machine's own ripple is what moved the log."""

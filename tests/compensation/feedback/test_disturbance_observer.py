@@ -147,12 +147,6 @@ class TestPrefilter:
         assert made.preview == 5
         assert design_prefilter(TABLE, cutoff_hz=500.0).preview == 10
 
-    def test_fir_of_the_paper(self) -> None:
-        fir = design_prefilter(TABLE, cutoff_hz=500.0).fir
-        assert fir is not None
-        expected = [0.2116, 0.1514, 0.1062, 0.0716, 0.0441, 0.0210]
-        assert fir[5:] == pytest.approx(expected, abs=5e-5)
-
     def test_zero_phase_overall(self) -> None:
         total = design_prefilter(TABLE).response(F_HZ) * TABLE.tracking(F_HZ)
         assert total == pytest.approx(np.cos(np.pi * F_HZ * DT) ** 2, abs=1e-8)

@@ -207,10 +207,6 @@ class TestInverse:
             design_wide_band(LOOPS, 4000.0)
         assert refused.value.reason == "inverse"
 
-    def test_a_period_shorter_than_the_low_pass_is_refused(self) -> None:
-        with pytest.raises(Refusal, match="shorter"):
-            design_wide_band(LOOPS, 7900.0, nyquist_pairs=4)
-
 
 class TestIntegralAction:
     """C with an integrator: V = P/(1 + PC) lets no constant through."""

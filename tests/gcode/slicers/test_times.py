@@ -14,10 +14,7 @@ K = TimeKind
 @pytest.mark.parametrize(
     ("line", "told"),
     [
-        (
-            b"; estimated printing time (normal mode) = 1d 2h 3m 4s\n",
-            [(K.TOTAL, 93_784.0, False)],
-        ),
+        (b"; estimated printing time (normal mode) = 1d 2h 3m 4s\n", [(K.TOTAL, 93_784.0, False)]),
         (b"; estimated printing time (silent mode) = 31m 29s\n", [(K.TOTAL, 1889.0, True)]),
         (b"; estimated printing time = 59s\r\n", [(K.TOTAL, 59.0, False)]),
         (
@@ -34,10 +31,7 @@ K = TimeKind
         (b";Print Time: 5523\n", [(K.TOTAL, 5523.0, False)]),
         (b";PRINTING_TIME: 25\n", [(K.ELAPSED, 25.0, False)]),
         (b";REMAINING_TIME: 5498\n", [(K.REMAINING, 5498.0, False)]),
-        (
-            b"; Calculated-during-export Build Time: 10.16 minutes\r\n",
-            [(K.TOTAL, 609.6, False)],
-        ),
+        (b"; Calculated-during-export Build Time: 10.16 minutes\r\n", [(K.TOTAL, 609.6, False)]),
         (b"; Estimated-in-GUI Build Time:         10.18 minutes\n", [(K.TOTAL, 610.8, False)]),
         (b"; --- print time: 806s ---\n", [(K.TOTAL, 806.0, False)]),
         (b";estimated_time(s): 9602.18\n", [(K.TOTAL, 9602.18, False)]),

@@ -31,16 +31,7 @@ def write_calibration_data(
     *,
     shapers: Mapping[str, Array] | None = None,
 ) -> Path:
-    """Write `calibration_data_<axis>_<name>.csv`, normalised as Klipper does; return its path.
-
-    Densities are divided by f + 0.1 and, below 10 Hz, multiplied by exp(1 - (10/(f + 0.1))^2)
-    (klippy/extras/shaper_calibrate.py, 2026-08).
-
-    Parameters
-    ----------
-    shapers : mapping of str to ndarray, optional
-        Remaining vibrations by column title, like "mzv(52.2)".
-    """
+    """Write `calibration_data_<axis>_<name>.csv` as klippy/extras/shaper_calibrate.py does."""
     path = folder / f"calibration_data_{file_axis(spectrum.axis)}_{name}.csv"
     f = spectrum.f_hz
     scale = np.where(f < 10.0, np.exp(1.0 - (10.0 / (f + 0.1)) ** 2), 1.0) / (f + 0.1)

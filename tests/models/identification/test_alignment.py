@@ -25,6 +25,7 @@ PLANT = ModesSpec(modes=(Mode(f_hz=47, zeta=0.035, gain=0.8), Mode(f_hz=95, zeta
 PLANTS = {"x": PLANT, "y": PLANT}
 SWAPPED = ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
 TURNED = ((2 / 3, -1 / 3, 2 / 3), (2 / 3, 2 / 3, -1 / 3), (-1 / 3, 2 / 3, 2 / 3))
+TURNED_SENSOR = Sensor(rate_hz=3187.3, rotation=TURNED, delay_s=0.6e-3, jitter_s=2e-6)
 # Group delay of PLANT towards 0 Hz, sum of gain 2 zeta/w.
 SLOW_S = 0.8 * 0.035 / (np.pi * 47) + 0.2 * 0.06 / (np.pi * 95)
 
@@ -35,12 +36,17 @@ def log_of(excitation: Excitation = SHORT, **options: object) -> AccelerationLog
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("excitation", [NEW, LEGACY, NEW_Y])
 @pytest.mark.parametrize(
-    "sensor",
-    [ADXL345, LIS2DW, Sensor(rate_hz=3187.3, rotation=TURNED, delay_s=0.6e-3, jitter_s=2e-6)],
+    ("excitation", "sensor", "offset_s"),
+    [
+        (NEW, ADXL345, -0.5),
+        (NEW, TURNED_SENSOR, 0.37),
+        (LEGACY, LIS2DW, 0.37),
+        (LEGACY, TURNED_SENSOR, -0.5),
+        (NEW_Y, ADXL345, 0.37),
+        (NEW_Y, LIS2DW, -0.5),
+    ],
 )
-@pytest.mark.parametrize("offset_s", [-0.5, 0.37])
 def test_start_and_direction_are_found(
     excitation: Excitation, sensor: Sensor, offset_s: float
 ) -> None:

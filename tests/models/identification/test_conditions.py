@@ -28,22 +28,7 @@ def test_what_is_read(text: str, expected: Condition) -> None:
 
 
 @pytest.mark.parametrize(
-    "text",
-    [
-        "0.5kg",
-        "500 g",
-        "+0kg",
-        "+0.5",
-        "+kg",
-        "+-1kg",
-        "+1lb",
-        "z=",
-        "z=high",
-        "z=1e3",
-        "a=1",
-        "x=1;y=2",
-        "z=1,z=2",
-    ],
+    "text", ["0.5kg", "+0kg", "+0.5", "+-1kg", "+1lb", "z=", "z=1e3", "a=1", "x=1;y=2", "z=1,z=2"]
 )
 def test_what_is_refused(text: str) -> None:
     with pytest.raises(ModelError, match="condition"):

@@ -51,8 +51,9 @@ def measured(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("gains", [(0.75, 0.2, 0.05), (0.6, 0.3, 0.1), (1.2, -0.15, -0.05)])
+@pytest.mark.parametrize(
+    ("seed", "gains"), [(0, (0.75, 0.2, 0.05)), (1, (0.6, 0.3, 0.1)), (2, (1.2, -0.15, -0.05))]
+)
 def test_modes_of_a_simulated_log(seed: int, gains: tuple[float, ...]) -> None:
     """Within 0.1 % and 2 % (reference notes, section 9), NRMSE below 0.5 %."""
     plant = modal(TRUTH, gains)
@@ -85,7 +86,7 @@ def test_order_follows_what_the_noise_leaves_to_see() -> None:
     assert fit_response(measured(modal(TRUTH[:1], (1.0,)), noise=0.03)).order == 1
 
 
-@pytest.mark.parametrize("delay_s", [-3e-3, pytest.param(0.0, marks=pytest.mark.slow), 8e-3])
+@pytest.mark.parametrize("delay_s", [-3e-3, 8e-3])
 def test_delay_is_set_aside(delay_s: float) -> None:
     fit = fit_response(measured(modal(TRUTH[:2], (0.7, 0.3)), delay_s=delay_s))
     assert fit.delay_s == pytest.approx(delay_s, abs=0.1e-3)
@@ -184,24 +185,20 @@ def test_progress_ends_with_the_orders_tried() -> None:
 
 @pytest.mark.shared
 def test_flexible_link(shared_dir: Path) -> None:
-    """A real robot, three sweeps: two other programs found 2.12/.124 or 2.10/.128 Hz, and 8 %.
-
-    The rest is friction, which more modes cannot explain.
-    """
+    """A real robot, three sweeps: two other programs found 2.12/.124 or 2.10/.128 Hz, and 8 %."""
     logs = []
     for path in sorted((shared_dir / "measurements" / "ryanGT_flexlink").glob("swept*.txt")):
         rows = np.loadtxt(path)
         logs.append(DrivenLog(rows[:, 0], rows[:, 2], rows[:, 5], source=path.name))
     fit = fit_response(estimate_driven(logs), band_hz=(0.4, 9.6))
     assert fit.order == 2
-    assert fit.residual < 0.10
+    assert fit.residual < 0.10  # the rest is friction, which more modes cannot explain
     assert fit.modes[0].f_hz == pytest.approx(2.11, rel=0.02)
     assert fit.modes[0].zeta == pytest.approx(0.126, rel=0.15)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("correlated", [False, True])
-def test_intervals_cover_the_truth(correlated: bool) -> None:
+def test_intervals_cover_the_truth() -> None:
     """Of many noisy measurements, 95 % intervals hold the truth in about 95 %."""
     plant = modal(TRUTH[:2], (0.75, 0.25))
     scores = []
@@ -211,7 +208,7 @@ def test_intervals_cover_the_truth(correlated: bool) -> None:
         n = len(clean.f_hz) + 4
         noise = (rng.standard_normal(n) + 1j * rng.standard_normal(n)) / np.sqrt(2)
         # Bands that overlap share data: neighbours err alike.
-        noise = np.convolve(noise, np.ones(5) / np.sqrt(5), "valid") if correlated else noise[4:]
+        noise = np.convolve(noise, np.ones(5) / np.sqrt(5), "valid")
         sd = 0.02 * np.abs(clean.response)
         noisy = replace(clean, response=clean.response + sd * noise, sd=sd)
         modes = fit_response(noisy, max_order=2).modes

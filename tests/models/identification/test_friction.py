@@ -48,25 +48,21 @@ def logs(  # type: ignore[no-untyped-def]
     return out
 
 
-@pytest.mark.parametrize(
-    "test", [pytest.param(OLD_TEST, marks=pytest.mark.slow), NEW_TEST], ids=["old", "new"]
-)
-def test_it_is_told_by_the_log(test: Excitation) -> None:
+def test_it_is_told_by_the_log() -> None:
     printer = draw("bed slinger", 3)
-    read = logs(printer, test, runs=2)
+    read = logs(printer, NEW_TEST, runs=2)
     found = dry_friction([one[1] for one in read], [[one[2] for one in read]])
     assert found.held_mm == pytest.approx(held_mm(printer, 0), rel=0.3)
     # What is left follows the command better.
     log, aligned, response = read[0]
-    again = estimate_aligned(log, freed(aligned, response, found)[0], test)
+    again = estimate_aligned(log, freed(aligned, response, found)[0], NEW_TEST)
     low = (response.f_hz > 8) & (response.f_hz < 25)
     assert np.mean(1 - again.coherence[low]) < 0.9 * np.mean(1 - response.coherence[low])
 
 
-@pytest.mark.parametrize("seed", [2, pytest.param(8, marks=pytest.mark.slow)])
-def test_a_frame_that_shakes_does_not_hide_it(seed: int) -> None:
+def test_a_frame_that_shakes_does_not_hide_it() -> None:
     """The sensor on a bed feels the frame too, at 8 Hz where friction shows most."""
-    printer = draw("bed slinger", seed)
+    printer = draw("bed slinger", 2)
     read = logs(printer, OLD_TEST, "y")
     felt = [one[2] for one in read]
     frame = frame_of(mean_response(felt))
@@ -84,11 +80,8 @@ def test_guides_that_do_not_rub_have_none() -> None:
     assert mean_response([one[2] for one in read]).f_hz[0] < 10
 
 
-@pytest.mark.parametrize("times", [pytest.param(4.0, marks=pytest.mark.slow), 8.0])
-def test_strong_friction_delays_the_fundamental_which_alignment_takes_for_a_later_start(
-    times: float,
-) -> None:
-    printer = rubbing(draw("bed slinger", 3), times)
+def test_strong_friction_delays_the_fundamental_which_alignment_takes_for_a_later_start() -> None:
+    printer = rubbing(draw("bed slinger", 3), 8.0)
     read = logs(printer, OLD_TEST)
     found = dry_friction([one[1] for one in read], [[one[2] for one in read]])
     assert found.held_mm == pytest.approx(held_mm(printer, 0), rel=0.3)

@@ -51,16 +51,6 @@ def test_response_is_that_of_python_control(grounded: float) -> None:
     )
 
 
-@pytest.mark.parametrize("grounded", [0.0, 0.4])
-def test_parameters_and_spec_are_inverse(grounded: float) -> None:
-    structure = ModalStructure(2, 30.0, grounded=grounded > 0)
-    theta = structure.parameters_of(plant(grounded))
-    assert len(theta) == structure.size
-    np.testing.assert_allclose(
-        structure.parameters_of(structure.spec(theta)), theta, rtol=1e-12, atol=1e-12
-    )
-
-
 @settings(max_examples=50)
 @given(vectors())
 def test_slow_motion_is_late_by_what_is_grounded_alone(
@@ -91,12 +81,3 @@ def test_gradient_is_the_derivative(case: tuple[ModalStructure, np.ndarray]) -> 
         np.testing.assert_allclose(exact, numeric, atol=2e-5 * scale + 1e-8)
     logs = structure.log_gradient(theta, F) * structure.response(theta, F)[:, None]
     np.testing.assert_allclose(logs, gradient, rtol=1e-9, atol=1e-12)
-
-
-@pytest.mark.parametrize("grounded", [False, True])
-def test_bounds_hold_the_parameters(grounded: bool) -> None:
-    structure = ModalStructure(2, 30.0, grounded)
-    low, high = structure.bounds((5.0, 150.0), (0.003, 1.0), (-2.0, 2.5))
-    theta = structure.parameters_of(plant())
-    assert len(low) == len(high) == structure.size
-    assert np.all((theta >= low) & (theta <= high))

@@ -124,14 +124,13 @@ def test_dead_columns() -> None:
 @pytest.mark.parametrize("value", ["nan", "inf", "abc", "", "1e300", "0x10", "1_0"])
 def test_bad_value_names_line_and_column(value: str) -> None:
     text = changed(klipper(*some_log()), 7, f"75.3,1.0,{value},2.0")
-    with pytest.raises(ModelError, match=r"line 7: .*|rows cannot be read"):
+    with pytest.raises(
+        ModelError, match=rf"line 7: accel_y is '{value}'|cannot be read as numbers"
+    ):
         read(text)
 
 
-def test_bad_value_message() -> None:
-    text = changed(klipper(*some_log()), 7, "75.3,1.0,nan,2.0")
-    with pytest.raises(ModelError, match=r"line 7: accel_y is 'nan', not a finite number"):
-        read(text)
+def test_missing_field_names_its_line() -> None:
     text = changed(klipper(*some_log()), 8, "75.3,1.0,2.0")
     with pytest.raises(ModelError, match="line 8: 3 fields where 4 are expected"):
         read(text)

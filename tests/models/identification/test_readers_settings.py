@@ -106,7 +106,7 @@ def test_refusals() -> None:
             ReadSettings.model_validate(wrong)
 
 
-@pytest.mark.parametrize("text", ["", "xy", "0,0", "1.0,1.0,1.0", "1,2,3,4", "nan,1"])
+@pytest.mark.parametrize("text", ["", "xy", "0,0", "1,2,3,4", "nan,1"])
 def test_no_direction(text: str) -> None:
     with pytest.raises(ModelError, match="not a direction"):
         direction_of(text)

@@ -148,12 +148,6 @@ def test_spectra_make_a_set_of_what_explains_them() -> None:
     assert several.fit.modes[0].f_hz == pytest.approx(47.0, rel=0.01)
 
 
-def test_spectra_of_different_tests_have_no_mean() -> None:
-    pair = [spectrum(plant(), 0), spectrum(plant(), 1)]
-    with pytest.raises(ModelError, match="different tests"):
-        explanations(pair, [TEST, replace(TEST, accel_per_hz_mm_s=60.0)])
-
-
 def test_a_model_that_was_read_is_varied() -> None:
     made = model_file_set(plant())
     assert made.provenance is not None

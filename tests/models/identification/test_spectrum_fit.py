@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.excitation import drive_spectrum, klipper_psd
-from stillpath.models.identification.frame import LIKELY, without_frame
-from stillpath.models.identification.readers import read_measurements
+from stillpath.models.identification.frame import LIKELY
 from stillpath.models.identification.spectrum_fit import (
     Explained,
     Explanations,
@@ -29,8 +27,6 @@ from stillpath.models.identification.types import Excitation, Fit, Spectrum
 from stillpath.models.plants import (
     Mode,
     ModesSpec,
-    RelativeMode,
-    RelativeModesSpec,
     frequency_response,
 )
 
@@ -129,24 +125,6 @@ def test_members_stand_for_what_explains_the_spectrum() -> None:
     assert again.population == found.population
 
 
-def test_a_frame_is_taken_out_where_it_may_be_one() -> None:
-    with_frame = RelativeModesSpec(
-        modes=(
-            RelativeMode(f_hz=14.0, zeta=0.1, share=0.1),
-            RelativeMode(f_hz=45.0, zeta=0.06, share=0.9),
-        )
-    )
-    (left,) = without_frame(with_frame).modes
-    assert (left.f_hz, left.share) == (45.0, pytest.approx(1.0))
-    heavy = with_frame.model_copy(
-        update={
-            "modes": (with_frame.modes[0].model_copy(update={"share": 0.5}), with_frame.modes[1])
-        }
-    )
-    assert without_frame(heavy).modes[0].f_hz == 14.0
-    assert narrow().explained(frame_likely=0.0).fit.order >= 2
-
-
 def test_most_plants_are_without_a_mode_that_may_be_the_frame_s() -> None:
     """Unless the frame stands firm; which mode that is, is said."""
     spectrum = simulated(((14.0, 0.1), (45.0, 0.06)), (0.1, 0.9), LEGACY)
@@ -213,10 +191,7 @@ def test_column_that_follows_the_drive() -> None:
     assert driven_column(spectrum) == "x"
     turned = replace(spectrum, psd={"x": spectrum.psd["y"], "z": spectrum.psd["x"]})
     assert driven_column(turned) == "z"
-    assert (
-        explain_spectra([turned], LEGACY).fit.spec
-        == explain_spectra([spectrum], LEGACY, column="x").fit.spec
-    )
+    assert explain_spectra([turned], LEGACY).fit.spec == narrow().explained().fit.spec
     with pytest.raises(ModelError, match="no column 'q'; there are x, z"):
         explain_spectra([turned], LEGACY, column="q")
 
@@ -229,7 +204,7 @@ def test_coupled_axes_are_told() -> None:
     assert any(
         "'y' has 30% of the power of 'x'" in n for n in explain_spectra([coupled], LEGACY).fit.notes
     )
-    assert not any("power of" in n for n in explain_spectra([spectrum], LEGACY).fit.notes)
+    assert not any("power of" in n for n in narrow().explained().fit.notes)
 
 
 def test_dead_column_and_short_band_are_refused() -> None:
@@ -249,25 +224,3 @@ def test_refit_keeps_the_structure() -> None:
     for mode, (f, zeta) in zip(member.modes, moved, strict=True):
         assert mode.f_hz == pytest.approx(f, rel=0.005)
         assert mode.zeta == pytest.approx(zeta, rel=0.15)
-
-
-@pytest.mark.slow
-@pytest.mark.shared
-@pytest.mark.parametrize(
-    ("file", "f_hz", "peak"),
-    [
-        ("bassco_v0/resonances_x_20220703_144605", 126.0, 3.8),
-        ("bassco_v0/resonances_y_20220703_143119", 83.0, 3.1),
-        ("nielsvz_annexK3/resonances_x_20220522_092825", 95.0, 14.9),
-    ],
-)
-def test_main_mode_of_real_axes(shared_dir: Path, file: str, f_hz: float, peak: float) -> None:
-    """Figures of an independent fit of the same files (reference notes, section 5)."""
-    (spectrum,) = read_measurements(shared_dir / "measurements" / f"{file}.csv")
-    assert isinstance(spectrum, Spectrum)
-    fit = explain_spectra([spectrum], LEGACY).fit
-    f = np.linspace(*fit.band_hz, 2000)
-    size = np.abs(frequency_response(fit.spec, f))
-    # Of pairs, and at the edge of the band: not the same structure.
-    assert f[np.argmax(size)] == pytest.approx(f_hz, rel=0.04)
-    assert size.max() == pytest.approx(peak, rel=0.4)

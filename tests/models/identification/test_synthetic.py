@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.signal import lsim
@@ -16,9 +14,8 @@ from stillpath.models.identification.synthetic import (
     acceleration_response,
     simulate_log,
     simulate_spectrum,
-    write_raw_data,
 )
-from stillpath.models.identification.types import Excitation, Spectrum
+from stillpath.models.identification.types import Excitation
 from stillpath.models.plants import (
     FirSpec,
     Mode,
@@ -28,7 +25,6 @@ from stillpath.models.plants import (
     ZeroPair,
     frequency_response,
 )
-from tests.models.identification.klipper_files import write_calibration_data, write_resonances
 
 SHORT = Excitation((1.0, 0.0), 5.0, 9.0, 60.0, 2.0)
 NEW = Excitation((1.0, 0.0))
@@ -99,12 +95,6 @@ def test_the_machine_stands_still_after_the_test() -> None:
     assert np.abs(log.accel_mm_s2[-10:, 0]).max() < 0.1
 
 
-def test_same_seed_same_log() -> None:
-    logs = [simulate_log({"x": PAIRS}, SHORT, rng=np.random.default_rng(6)) for _ in range(2)]
-    np.testing.assert_array_equal(logs[0].accel_mm_s2, logs[1].accel_mm_s2)
-    np.testing.assert_array_equal(logs[0].time_s, logs[1].time_s)
-
-
 def test_a_diagonal_test_moves_both_axes() -> None:
     both = Excitation((0.6, 0.8), 5.0, 9.0)
     quiet = Sensor(noise_mm_s2=0.0, lsb_mm_s2=0.0)
@@ -124,32 +114,3 @@ def test_a_spectrum_is_drive_times_squared_response() -> None:
     np.testing.assert_allclose(spectrum.psd["x"][used], expected[used], rtol=0.03)
     total = sum(spectrum.psd[c] for c in "xyz")
     np.testing.assert_allclose(spectrum.psd["xyz"], total, rtol=1e-12)
-
-
-def test_raw_data_is_written_as_klipper_writes_it(tmp_path: Path) -> None:
-    log = simulate_log({"y": PAIRS}, Excitation((0.0, 1.0), 5.0, 9.0), rng=np.random.default_rng(9))
-    path = write_raw_data(log, tmp_path)
-    assert path.name == "raw_data_y_20260101_120000.csv"
-    assert path.read_text().startswith("#time,accel_x,accel_y,accel_z\n")
-    table = np.loadtxt(path, delimiter=",")
-    np.testing.assert_allclose(table[:, 0], log.time_s, atol=6e-7)
-    np.testing.assert_allclose(table[:, 1:], log.accel_mm_s2, atol=6e-7)
-
-
-def test_tables_of_spectra_are_written_as_klipper_writes_them(tmp_path: Path) -> None:
-    f = np.arange(0.0, 200.0, 1.5625)
-    psd = {c: (i + 1.0) * (f + 1.0) for i, c in enumerate(("x", "y", "z", "xyz"))}
-    spectrum = Spectrum(f, psd, "1.000,-1.000")
-    plain = write_resonances(spectrum, tmp_path)
-    normalised = write_calibration_data(spectrum, tmp_path, shapers={"mzv(52.2)": f / 200})
-    assert plain.name == "resonances_axis=1.000,-1.000,0.000_20260101_120000.csv"
-    lines = normalised.read_text().splitlines()
-    assert lines[0] == "freq,psd_x,psd_y,psd_z,psd_xyz,shapers:,mzv(52.2)"
-    values = np.array([[float(v or 0) for v in line.split(",")] for line in lines[1:]])
-    before = np.loadtxt(plain, delimiter=",", skiprows=1)
-    assert before.shape == (len(f), 5)
-    # Undone as written in section 2 of the reference: PSD = value (f + 0.1) above 10 Hz.
-    above = before[:, 0] > 10
-    undone = values[above, 1:5] * (f[above, None] + 0.1)
-    np.testing.assert_allclose(undone, before[above, 1:], rtol=2e-3)
-    assert values[~above, 1].max() < values[above, 1].max()
