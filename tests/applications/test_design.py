@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,6 @@ import numpy as np
 import pytest
 from scipy.linalg import toeplitz
 from scipy.signal import dfreqresp
-from starlette.testclient import TestClient
 
 from stillpath.applications.design import design as module
 from stillpath.applications.design.design import design_report
@@ -21,7 +19,6 @@ from stillpath.applications.design.figures import DesignReport
 from stillpath.applications.design.page import render_design, write_design
 from stillpath.applications.design.summary import Summary
 from stillpath.cli.main import run
-from stillpath.compensation.base import DesignError
 from stillpath.compensation.fbf import LADDER, PreviewFbf
 from stillpath.compensation.shapers import shape, shaper_pulses
 from stillpath.models.machine import Machine
@@ -37,11 +34,6 @@ from stillpath.models.plants import (
 from stillpath.models.store import load_machine
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.reports.charts import Chart, Line, Mark, draw
-from stillpath.service.api import create_app
-from stillpath.service.api import designs as routes
-from stillpath.service.api.computing import ComputeRequest
-from stillpath.service.settings import Settings
-from tests.service.runners import pretend
 
 GOLDEN = Path(__file__).parents[2] / "examples" / "machines" / "klipper-golden.json"
 DT = 1e-3
@@ -317,15 +309,6 @@ def test_taps_have_no_frequencies() -> None:
     assert "as measured" in render_design(report)
 
 
-@pytest.mark.parametrize(
-    ("settings", "words"),
-    [({"axis": "z"}, "x, y"), ({"basis": "fourier"}, "ce-opt"), ({"robust": "yes"}, "minimax")],
-)
-def test_unknown_settings(machine: Machine, settings: dict[str, str], words: str) -> None:
-    with pytest.raises(DesignError, match=words):
-        report_of(machine, **settings)
-
-
 class Page(HTMLParser):
     """Checks nesting, and collects what a screen reader is told."""
 
@@ -429,64 +412,9 @@ def test_command(
         assert capsys.readouterr().err.startswith("stillpath: error: ")
 
 
-@pytest.fixture
-def client(
-    tmp_path: Path, off: DesignReport, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[TestClient]:
-    # What a job computes takes ten seconds; tests/service/api/test_computing.py has real ones.
-    async def pretended(_: Any, __: Any, asked: ComputeRequest) -> Any:
-        given = asked.options
-        settings = (given["axis"], given["basis"], given["robust"])
-        pretended.calls.append((asked.document.name, *settings))
-
-    async def answer(*_: Any) -> Any:
-        return off.model_dump(mode="json")
-
-    pretended.calls = []
-    monkeypatch.setattr(routes, "run_and_wait", pretended)
-    monkeypatch.setattr(routes, "read_result", answer)
-    app = create_app(Settings(data_dir=tmp_path), runner=pretend)
-    with TestClient(app, base_url="http://localhost", raise_server_exceptions=False) as opened:
-        opened.calls = pretended.calls
-        yield opened
-
-
-def test_api(client: Any, off: DesignReport) -> None:
-    where = "/v1/machines/ender3/design"
-    answer = client.get(f"{where}?axis=x")
-    assert answer.status_code == 200
-    assert answer.headers["content-type"] == "application/json"
-    assert DesignReport.model_validate_json(answer.content) == off
-    browser = {"Accept": "text/html,application/xhtml+xml,*/*;q=0.8"}
-    for page in (
-        client.get(f"{where}?axis=x", headers=browser),
-        client.get(f"{where}.html?axis=x"),
-    ):
-        assert page.headers["content-type"].startswith("text/html")
-        assert "Creality Ender 3, axis X" in page.text
-    assert client.calls == [("ender3", "x", "ce-opt", "auto")] * 3
-    client.get(f"{where}?axis=x&robust=minimax&basis=dct")
-    assert client.calls[3:] == [("ender3", "x", "dct", "minimax")]
-    for url, status, word in (
-        (where, 422, "axis"),
-        (f"{where}?axis=z", 422, "axis"),
-        (f"{where}?axis=x&basis=fourier", 422, "basis"),
-        (f"{where}.html?axis=x&robust=yes", 422, "robust"),
-        ("/v1/machines/nope/design?axis=x", 404, "nope"),
-    ):
-        problem = client.get(url)
-        assert problem.status_code == status
-        assert problem.headers["content-type"] == "application/problem+json"
-        assert word in problem.json()["detail"]
-    assert "/v1/machines/{name}/design" in client.get("/openapi.json").json()["paths"]
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "axis"), [("taz6-x", "x"), ("voron-v0", "y"), ("generic-corexy", "x")]
-)
-def test_whole_report(name: str, axis: str) -> None:
-    report = design_report(load_machine(name), axis)
+def test_whole_report() -> None:
+    report = design_report(load_machine("taz6-x"), "x")
     assert len(report.robustness.errors_percent) == 21
     assert len(report.robustness.curves) == 9
     assert report.robustness.missing == ()

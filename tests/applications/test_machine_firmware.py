@@ -106,12 +106,6 @@ def test_a_wrong_section_is_named(capsys, tmp_path, section: str, message: str) 
     assert message in err
 
 
-def test_built_in_machines_stay(capsys) -> None:
-    code, _, err = stillpath(capsys, "machines", "set-firmware", "ender3", EXAMPLES / "marlin.json")
-    assert code == 2
-    assert "ender3" in err
-
-
 def test_a_section_without_kind_is_klippers() -> None:
     machine = load_machine("ender3")
     document = machine.model_dump(mode="json")

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stillpath.applications.proof.coupon import coupon_program, write_coupon
+from stillpath.applications.proof.coupon import coupon_program
 from stillpath.applications.proof.page import write_readback
 from stillpath.applications.proof.program import PrintSettings
 from stillpath.applications.proof.readback import verify_log
@@ -172,9 +172,8 @@ def test_files_that_are_no_log(machine, printed, tmp_path):
         ("taz6-x", 3200, 1 - 1e-4, 300, 20),
     ],
 )
-def test_compensated_prints(name, rate_hz, clock, start_s, seconds, tmp_path, cache):
-    machine, printed, log = load_machine(name), tmp_path / "c.gcode", tmp_path / "log.csv"
-    write_coupon(machine, printed, cache_dir=cache)
+def test_compensated_prints(name, rate_hz, clock, start_s, seconds, tmp_path, coupon_of):
+    machine, printed, log = load_machine(name), coupon_of(name)[0], tmp_path / "log.csv"
     record(
         printed,
         machine,

@@ -95,20 +95,8 @@ def test_compensate_writes_file_report_and_table(pipeline, source, tmp_path, cap
 
 def test_options_reach_the_pipeline(pipeline, source, tmp_path):
     chosen = [
-        "--method",
-        "shaper:2hump_ei",
-        "--basis",
-        "bspline",
-        "--robust",
-        "minimax",
-        "--along",
-        ".1",
-        "--tolerance-um",
-        "2",
-        "--plate",
-        "3",
-        "--dialect",
-        "marlin",
+        *("--method", "shaper:2hump_ei", "--basis", "bspline", "--robust", "minimax"),
+        *("--along", ".1", "--tolerance-um", "2", "--plate", "3", "--dialect", "marlin"),
     ]
     assert compensate(source, "-o", str(tmp_path / "o"), "-m", "voron-v0", *chosen) == 0
     assert pipeline.machine == "voron-v0"
@@ -233,14 +221,6 @@ def test_plan_and_simulate(pipeline, source, tmp_path, capsys):
     assert run([*plan, "-o", str(motion), "--rate", "0"]) == 2
     assert run(["simulate", str(source), "-m", "ender3", "--report", str(report)]) == 0
     assert (report / "report.html").exists()
-
-
-def test_machines(capsys):
-    assert run(["machines"]) == 0
-    assert "ender3" in capsys.readouterr().out
-    assert run(["machines", "ender3"]) == 0
-    assert '"kinematics": "cartesian"' in capsys.readouterr().out
-    assert run(["machines", "nope"]) == 2
 
 
 @pytest.mark.parametrize(

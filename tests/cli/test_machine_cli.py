@@ -189,15 +189,6 @@ def test_bad_settings_are_refused(monkeypatch: pytest.MonkeyPatch, capsys):
 # Klipper's configuration
 
 
-def test_what_a_printer_cfg_says(config: Path):
-    found = read_printer_config(config)
-    assert found.includes == ("mainsail.cfg",)
-    assert found.number("printer", "max_accel") == 4000.0  # the macro's text is none
-    assert found.text("input_shaper", "shaper_type_x") == "ei"  # the file's own wins
-    assert found.number("input_shaper", "shaper_freq_x") == 61.2
-    assert found.sections["printer"]["max_velocity"].line == 6
-
-
 def test_indentation_counts_as_in_configparser(tmp_path: Path):
     file = tmp_path / "printer.cfg"
     file.write_text(

@@ -57,8 +57,7 @@ class Cura:
                 stack = types.SimpleNamespace(getName=lambda: cura.printer)
                 information = types.SimpleNamespace(jobName=cura.job)
                 return types.SimpleNamespace(
-                    getGlobalContainerStack=lambda: stack,
-                    getPrintInformation=lambda: information,
+                    getGlobalContainerStack=lambda: stack, getPrintInformation=lambda: information
                 )
 
         class Script:

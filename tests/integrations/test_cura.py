@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import re
 import shlex
 import sys
 import types
@@ -15,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stillpath.pipeline.options import Options
-from tests.integrations.cura import SCRIPT, Cura
+from tests.integrations.cura import Cura
 from tests.integrations.posting import PROGRAM, environment
 
 LAYERS = [
@@ -29,6 +28,9 @@ LAYERS = [
 ]
 
 
+both_ways = pytest.mark.parametrize("script", ["server", "command"], indirect=True)
+
+
 @pytest.fixture
 def cura(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Cura:
     for name, value in environment(tmp_path).items():
@@ -38,16 +40,22 @@ def cura(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Cura:
     return made
 
 
-@pytest.fixture(params=["server", "command"])
+@pytest.fixture
 def script(request: Any, cura: Cura, address: str) -> Any:
+    """With the server itself, or where it is asked for with the program."""
     made = cura.load()
-    made.values |= {"where": request.param, "machine": "ender3", "server": address}
+    made.values |= {
+        "where": getattr(request, "param", "server"),
+        "machine": "ender3",
+        "server": address,
+    }
     made.values["command"] = " ".join(
         shlex.quote(word) for word in (sys.executable, str(PROGRAM), "--server", address)
     )
     return made
 
 
+@both_ways
 def test_layers_come_back_as_layers(cura: Cura, script: Any):
     given_layers = list(LAYERS)
     made = cura.write_started([script], given_layers)
@@ -65,6 +73,7 @@ def test_layers_come_back_as_layers(cura: Cura, script: Any):
     assert cura.write_started([script], made) is made
 
 
+@both_ways
 def test_failures_are_seen_and_the_layers_stay(cura: Cura, script: Any):
     layers = ["bad\nG1\n", "G1\n", "G1\nG1\nG1 X1e400\n"]
     made = cura.write_started([script], list(layers))
@@ -192,20 +201,6 @@ def test_a_bundled_cura_lends_its_libraries_to_nobody(cura: Cura, monkeypatch):
     assert not {"LD_LIBRARY_PATH", "PYTHONHOME"} & module._environment("a").keys()
     monkeypatch.setenv("LD_LIBRARY_PATH_ORIG", "/mine")
     assert module._environment("a")["LD_LIBRARY_PATH"] == "/mine"
-
-
-def test_one_client_in_both_files():
-    client = re.compile(r"(?s)# Client of the service:.*# End of the client\.\n")
-    (here,), (there,) = (client.findall(f.read_text("utf-8")) for f in (SCRIPT, PROGRAM))
-    assert here == there
-
-
-def test_cura_needs_nothing_but_its_own_python():
-    tree = ast.parse(SCRIPT.read_bytes(), feature_version=(3, 8))
-    modules = {a.name for n in ast.walk(tree) if isinstance(n, ast.Import) for a in n.names}
-    modules |= {n.module or "" for n in ast.walk(tree) if isinstance(n, ast.ImportFrom)}
-    tops = {module.partition(".")[0] for module in modules}
-    assert tops - {"UM", "Script"} <= set(sys.stdlib_module_names)
 
 
 def _module(cura: Cura) -> Any:

@@ -87,15 +87,6 @@ def test_ones_own_macros_move_under_ones_own_limits():
     assert limits(printer)[0] == (300.0, 5000.0, 5.0, 0.5)  # nothing of the cancelled print
 
 
-def test_a_pause_outside_of_stretches_gives_the_files_limits_back_and_leaves_the_shaper():
-    printer = Klipper(macros_of(USERS, OURS))
-    printer.run("SET_VELOCITY_LIMIT ACCEL=2500 SQUARE_CORNER_VELOCITY=3")
-    printer.run("PAUSE")
-    printer.run("PAUSE")  # twice, as impatient people do
-    printer.run("RESUME")
-    assert limits(printer) == ((300.0, 2500.0, 3.0, 0.5), 57.8)
-
-
 def test_resume_without_a_pause_brings_nothing_back():
     printer = in_stretch(USERS, OURS)
     printer.run("PAUSE")

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import ast
 import importlib
 import json
 import logging
 import re
 import sys
-import threading
 import tomllib
 import types
 from collections.abc import Callable, Iterator
@@ -24,7 +22,6 @@ from stillpath.pipeline.options import Options
 from stillpath.version import __version__
 from tests.integrations.breaking import BODY, TAKES_S, breaking_server
 from tests.integrations.octoprint import PLUGIN
-from tests.integrations.posting import PROGRAM
 from tests.integrations.running import Running
 from tests.service.test_server import until
 
@@ -57,12 +54,6 @@ def test_results_are_told_by_their_names(stem: str, suffix: str):
     assert choices.is_taken(made)
     assert choices.is_result(made)
     assert not choices.is_result(stem + suffix)
-
-
-def test_names():
-    assert choices.result_name("my parts/größe v1.2.GCODE") == "my parts/größe v1.2.sp.GCODE"
-    assert not choices.is_taken("part.stl")
-    assert not choices.is_result("part.sp.stl")
 
 
 @given(
@@ -278,9 +269,6 @@ def test_one_after_the_other(bench: Callable[..., Bench], running: Running):
         ({}, "no such", ("no such", "ender3")),
         ({}, "../jobs", ("../jobs",)),
         ({"key": "wrong", "odd": "key"}, "ender3", ("key", "401")),
-        ({"odd": "short"}, "ender3", ("no answer", "bytes came")),
-        ({"odd": "login"}, "ender3", ("no answer", "2 of", "bytes came")),
-        ({"odd": "lost"}, "ender3", ("bytes arrived",)),
         ({"odd": "moved"}, "ender3", ("moved to http://elsewhere.invalid/",)),
         ({"address": "http://127.0.0.1:9"}, "ender3", ("no answer from http://127.0.0.1:9",)),
         ({"address": "nas"}, "ender3", ("'nas' is not the address of a server",)),
@@ -295,18 +283,6 @@ def test_what_is_wrong_is_said(bench: Any, address: str, more: dict, machine: st
         assert word in entry.message
     assert not (here.files / "a.sp.gcode").exists()
     assert (here.files / "a.gcode").read_text() == "G1 X3\n"
-
-
-def test_cancel_stops_the_job_on_the_server(bench: Callable[..., Bench], running: Running):
-    here = bench()
-    entry, waiting = here.add("a.gcode", "slow G1\n"), here.add("b.gcode", "G1\n")
-    until(lambda: entry.job)
-    here.book.cancel(waiting)
-    assert waiting.state == "cancelled"
-    here.book.cancel(entry)
-    assert here.ended(entry).state == "cancelled"
-    until(lambda: running.client.get(f"/v1/jobs/{entry.job}").json()["state"] == "cancelled")
-    assert not (here.files / "a.sp.gcode").exists()
 
 
 def test_a_file_that_changes_or_goes_meanwhile(bench: Callable[..., Bench]):
@@ -430,28 +406,6 @@ def test_a_long_upload_that_breaks_off_is_sent_again(tmp_path: Path):
 # The package
 
 
-def test_one_client_in_all_files():
-    blocks = [
-        re.search(r"(?s)# Client of the service:.*# End of the client\.\n", path.read_text("utf-8"))
-        for path in (PROGRAM, FOLDER / "client.py")
-    ]
-    assert blocks[0][0] == blocks[1][0]
-
-
-def test_it_needs_octoprint_and_old_pythons_only():
-    of_octoprint = {"flask", "octoprint"}
-    for path in FOLDER.glob("*.py"):
-        tree = ast.parse(path.read_bytes(), feature_version=(3, 8))
-        tops = set()
-        for node in ast.walk(tree):
-            if isinstance(node, ast.Import):
-                tops |= {alias.name.partition(".")[0] for alias in node.names}
-            elif isinstance(node, ast.ImportFrom) and not node.level:
-                tops.add(str(node.module).partition(".")[0])
-        allowed = of_octoprint if path.name in ("__init__.py", "hosting.py") else set()
-        assert tops <= set(sys.stdlib_module_names) | allowed, path
-
-
 def test_versions_are_the_same():
     project = tomllib.loads((PLUGIN / "pyproject.toml").read_text())["project"]
     assert project["version"] == __version__
@@ -463,9 +417,3 @@ def test_every_setting_stands_in_the_dialogue():
     for name in choices.DEFAULTS:
         assert re.search(rf"(value|checked|foreach): {name}\b", dialogue), name
     json.dumps(choices.DEFAULTS)
-
-
-def test_threads_end(bench: Callable[..., Bench]):
-    here = bench()
-    here.worker.stop(60)
-    assert not [t for t in threading.enumerate() if t is here.worker._thread]

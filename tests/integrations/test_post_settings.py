@@ -18,6 +18,8 @@ import stillpath_post
 from stillpath_post import Failure, PrintJob, Settings, read_settings
 
 from tests.integrations.conventions import windows_split
+from tests.integrations.cura import SCRIPT
+from tests.integrations.octoprint import PLUGIN
 from tests.integrations.posting import PROGRAM, ROOT, post
 
 OUTPUT = "SLIC3R_PP_OUTPUT_NAME"
@@ -307,13 +309,31 @@ print(json.dumps(sorted(sys.modules)))
     assert not loaded & {"numpy", "numba", "scipy", "pydantic", "typer", "rich", "service"}
 
 
-def test_it_needs_python_3_8_and_its_standard_library_only():
-    tree = ast.parse(PROGRAM.read_bytes(), feature_version=(3, 8))
+@pytest.mark.parametrize(
+    ("path", "allowed"),
+    [
+        (PROGRAM, {"stillpath"}),  # asked for only when no server is named
+        (SCRIPT, {"UM", "Script"}),
+        *(
+            (path, {"flask", "octoprint"} if path.name in ("__init__.py", "hosting.py") else set())
+            for path in sorted((PLUGIN / "octoprint_stillpath").glob("*.py"))
+        ),
+    ],
+    ids=lambda value: value.name if isinstance(value, Path) else "",
+)
+def test_they_need_python_3_8_and_its_standard_library_only(path: Path, allowed: set[str]):
     imported = set()
-    for node in ast.walk(tree):
+    for node in ast.walk(ast.parse(path.read_bytes(), feature_version=(3, 8))):
         if isinstance(node, ast.Import):
             imported |= {alias.name.partition(".")[0] for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
+        elif isinstance(node, ast.ImportFrom) and not node.level:
             imported.add((node.module or "").partition(".")[0])
-    # The package is asked for only when no server is named.
-    assert imported - {"stillpath"} <= set(sys.stdlib_module_names)
+    assert imported - allowed <= set(sys.stdlib_module_names)
+
+
+def test_one_client_in_all_files():
+    client = re.compile(r"(?s)# Client of the service:.*# End of the client\.\n")
+    files = (PROGRAM, SCRIPT, PLUGIN / "octoprint_stillpath" / "client.py")
+    found = [client.findall(file.read_text("utf-8")) for file in files]
+    assert found[0] == found[1] == found[2]
+    assert len(found[0]) == 1

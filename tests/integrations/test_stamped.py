@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import io
 import json
-import shlex
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -23,7 +19,7 @@ from stillpath.models.store import load_machine
 from tests.gcode.container_files import binary, package
 from tests.integrations.cura import Cura
 from tests.integrations.moonraker import Config, Server, ServerError, component_module
-from tests.integrations.posting import PROGRAM, environment, post
+from tests.integrations.posting import environment, post
 from tests.service.test_server import REAL, finished, server
 
 REFUSED = "line 2: this file was already processed by stillpath; compensate the original"
@@ -62,18 +58,6 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["none", "advise"])
-def test_command_line(file: Path, tmp_path: Path, capsys: Any, method: str):
-    common = ["compensate", str(file), "--machine", "ender3", "--method", method]
-    common += ["--budget-um", "20"] if method == "advise" else []
-    for more in (["-o", str(tmp_path / "out.gcode")], ["--in-place"]):
-        assert run([*common, *more]) == 2
-        shown = capsys.readouterr().err
-        assert REFUSED.replace("compensate", method) in shown or REFUSED in shown
-    assert not (tmp_path / "out.gcode").exists()
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "content"),
     [("part.bgcode", binary(STAMPED)), ("part.gcode.3mf", package({1: STAMPED}))],
@@ -103,13 +87,6 @@ def test_batch(file: Path, tmp_path: Path):
     # (`watch` leaves it alone: tests/cli/batch/test_watching.py.)
 
 
-@pytest.mark.slow
-def test_slicers_script_on_this_computer(file: Path, tmp_path: Path):
-    done = post("--machine", "ender3", "--method", "none", file, home=tmp_path)
-    assert done.returncode == 2
-    assert done.stderr == f"stillpath-post: {REFUSED}\n"
-
-
 # On a server
 
 
@@ -121,22 +98,9 @@ def _job(address: str, place: str, **how: Any) -> dict[str, Any]:
         return finished(client, job)
 
 
-def _uploaded(address: str, file: Path) -> str:
-    given = {"machine": "ender3", "method": "none"}
-    return _job(address, "/v1/jobs", params=given, content=file.read_bytes())["error"]["detail"]
-
-
 def _sent_as_to_octoprint(address: str, file: Path) -> str:
     files = {"file": (file.name, file.read_bytes())}
     return _job(address, "/printers/ender3/api/files/local", files=files)["error"]["detail"]
-
-
-def _sent_by_the_command_line(address: str, file: Path) -> str:
-    said = io.StringIO()
-    command = ["compensate", str(file), "-m", "ender3", "--in-place", "--server", address]
-    with contextlib.redirect_stderr(said):
-        assert run([*command, "--method", "none"]) == 2
-    return said.getvalue()
 
 
 def _sent_by_the_slicers_script(address: str, file: Path) -> str:
@@ -172,27 +136,18 @@ def _sent_by_moonraker(address: str, file: Path) -> str:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "send",
-    [
-        _uploaded,
-        _sent_as_to_octoprint,
-        _sent_by_the_command_line,
-        _sent_by_the_slicers_script,
-        _sent_by_moonraker,
-    ],
+    "send", [_sent_as_to_octoprint, _sent_by_the_slicers_script, _sent_by_moonraker]
 )
 def test_server(send: Callable[[str, Path], str], address: str, file: Path):
     assert REFUSED in send(address, file)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("where", ["server", "command"])
-def test_cura(where: str, address: str, monkeypatch: pytest.MonkeyPatch):
+def test_cura(address: str, monkeypatch: pytest.MonkeyPatch):
     cura = Cura()
     cura.install(monkeypatch)
     script = cura.load()
-    script.values |= {"where": where, "machine": "ender3", "server": address, "method": "none"}
-    script.values["command"] = shlex.join([sys.executable, str(PROGRAM), "--server", address])
+    script.values |= {"where": "server", "machine": "ender3", "server": address, "method": "none"}
     layers = [HEAD, STAMPED.decode(), ";LAYER:0\nG1 X20\n"]
     made = cura.write_started([script], list(layers))
     assert made == [f"{HEAD};POSTPROCESSED\n", *layers[1:]]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +21,6 @@ from stillpath.models.machine import Machine
 from stillpath.models.plant_specs import ParametricMembers
 from stillpath.models.schedule import AxisSchedule, MassSchedule
 from stillpath.models.store import load_machine
-from stillpath.pipeline.advising.choosing import ladder
 from stillpath.pipeline.advising.inserting import MARK
 from stillpath.pipeline.advising.removing import remove_advice
 from stillpath.pipeline.compensate import compensate_file
@@ -272,16 +270,6 @@ def test_walls_are_slow_where_nothing_else_will_do(tmp_path: Path, cache: Path) 
     said = next(x for x in result.warnings if "settings for good" in x)
     assert said.startswith(f"Line {data.count(bytes([10]))} ")
     assert "no shaper is advised" in said
-
-
-def test_accelerations_to_choose_from() -> None:
-    machine = load_machine("ender3")
-    for top in (80.0, 100.0, 500.0, 599.0, 3000.0, 20_000.0):
-        rungs = ladder(top, machine)
-        assert rungs[-1] == min(top, machine.command.accel_mm_s2)
-        assert rungs == sorted(set(rungs))
-        assert rungs[0] >= min(top, 100.0)
-        assert all(b / a < 1.7 for a, b in pairwise(rungs))
 
 
 def test_a_file_with_the_mark_is_refused(tmp_path: Path, cache: Path) -> None:

@@ -34,25 +34,11 @@ ADVICE = Advice(
 
 LINES = st.sampled_from(
     [
-        ";TYPE:External perimeter",
-        ";TYPE:Perimeter",
-        ";TYPE:Bridge infill",
-        ";LAYER_CHANGE",
-        "M204 S900",
-        "SET_VELOCITY_LIMIT ACCEL=5200",
-        "SET_VELOCITY_LIMIT SQUARE_CORNER_VELOCITY=7",
-        "SET_INPUT_SHAPER SHAPER_FREQ_X=50",
-        "MACRO",
-        "G4 P10",
-        "G92 E0",
-        "; a remark",
-        "",
-        "G1 X10 Y10 E1 F3000",
-        "G1 X20 Y15 E1",
-        "G1 X15 E1",
-        "G1 X50 Y50 F9000",
-        "G1 Z.6",
-        "G1 E-.8",
+        *(";TYPE:External perimeter", ";TYPE:Perimeter", ";TYPE:Bridge infill", ";LAYER_CHANGE"),
+        *("M204 S900", "SET_VELOCITY_LIMIT ACCEL=5200"),
+        *("SET_VELOCITY_LIMIT SQUARE_CORNER_VELOCITY=7", "SET_INPUT_SHAPER SHAPER_FREQ_X=50"),
+        *("MACRO", "G4 P10", "G92 E0", "; a remark", "", "G1 X10 Y10 E1 F3000", "G1 X20 Y15 E1"),
+        *("G1 X15 E1", "G1 X50 Y50 F9000", "G1 Z.6", "G1 E-.8"),
     ]
 )
 
@@ -275,17 +261,10 @@ TEXTS = st.one_of(
     LINES.map(str.encode),
     st.sampled_from(
         [
-            b";TYPE:External perimeter \xb5m",
-            b"; stillpath",
-            b"; advised by hand: ; Stillpath Advise",
-            b"M117 50% ; stillpath",
-            b"\xff\xfe\x00",
-            b"\t ",
-            b"N7 G1 X12 E1*99",
-            b"T1",
-            b"M500",
-            b"G1 X30 E1 ; \xe2\x80\xa8 a line separator",
-            b"G1 X31\x0bE1\x0c",
+            *(b";TYPE:External perimeter \xb5m", b"; stillpath"),
+            *(b"; advised by hand: ; Stillpath Advise", b"M117 50% ; stillpath", b"\xff\xfe\x00"),
+            *(b"\t ", b"N7 G1 X12 E1*99", b"T1", b"M500"),
+            *(b"G1 X30 E1 ; \xe2\x80\xa8 a line separator", b"G1 X31\x0bE1\x0c"),
         ]
     ),
     st.binary(max_size=12),

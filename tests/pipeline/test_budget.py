@@ -9,7 +9,7 @@ import pytest
 from stillpath.cli.console import budget_line
 from stillpath.models.store import load_machine
 from stillpath.pipeline import piece_compensator
-from stillpath.pipeline.options import Options
+from stillpath.pipeline.options import Options, stamp
 from tests.compensating import compensated
 from tests.gcode.cutting import HEAD
 from tests.gcode.prints import polygon
@@ -109,9 +109,12 @@ def test_without_a_method_it_is_not_used(tmp_path: Path, cache: Path, sliced: by
     assert any("Without effect: budget_um" in warning for warning in result.warnings)
 
 
-def test_options_without_a_budget_are_those_of_before() -> None:
-    assert "budget_um" not in Options().model_dump()
+def test_options_of_later_versions_change_no_digest() -> None:
+    assert not {"budget_um", "where", "max_mb", "compare_live"} & Options().model_dump().keys()
     assert "budget_um" not in Options().model_dump_json()
+    assert Options(where="walls").model_dump()["where"] == "walls"
+    machine = load_machine("ender3")
+    assert stamp(machine, Options(compare_live=True)) == stamp(machine, Options())
     assert Options.model_validate(Options(budget_um=3).model_dump()).budget_um == 3
     for bad in (0.4, 1001, float("nan")):
         with pytest.raises(ValueError, match="budget_um"):

@@ -38,6 +38,7 @@ def compensate(
     source.write_bytes(content)
     machine = load_machine("ender3")
     result = compensate_file(source, target, machine, Options(**options), cache_dir=cache)
+    assert result.last_check is None or result.last_check.kept_lines > 5
     assert (result.original_bytes, result.written_bytes) == (len(content), target.stat().st_size)
     assert sorted(p.name for p in folder.iterdir()) == sorted([name, target.name])
     return target.read_bytes()

@@ -26,8 +26,15 @@ FILES = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", sorted(FILES))
-@pytest.mark.parametrize("method", ["none", "shaper:mzv", "simulate", "plan"])
+@pytest.mark.parametrize(
+    ("name", "method"),
+    [
+        *((name, "shaper:mzv") for name in sorted(FILES)),
+        ("dwell", "none"),
+        ("dwells", "simulate"),
+        ("move", "plan"),
+    ],
+)
 def test_refused(tmp_path: Path, cache: Path, name: str, method: str) -> None:
     text, message = FILES[name]
     source, target = tmp_path / "in.gcode", tmp_path / "out"

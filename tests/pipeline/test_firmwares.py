@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 
 import pytest
 
 from stillpath.models.errors import ModelError
-from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine
 from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.measuring.reference_shaper import cached_shaper
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.simulate import plan_file, simulate_file
 from tests.compensating import compensated
+from tests.gcode.cutting import ender3_with
 from tests.gcode.prints import polygon
 from tests.gcode.states import differences, tagged
 
-EXAMPLES = Path(__file__).parents[2] / "examples"
 KINDS = ("marlin", "reprapfirmware")
 
 LIMITS = {"marlin": "M204 P1200 T1500", "reprapfirmware": "M204 P1200 T1500"}
@@ -32,12 +30,6 @@ BODY = (
 )
 
 
-def machine_with(kind: str, base: str = "ender3") -> Machine:
-    document = load_machine(base).model_dump(mode="json")
-    section = json.loads((EXAMPLES / "firmware" / f"{kind}.json").read_text())
-    return Machine.model_validate(document | {"firmware": section})
-
-
 def body(kind: str) -> bytes:
     # Marlin's G90 makes E absolute.
     relative = "M83\n" if kind == "marlin" else ""
@@ -46,7 +38,7 @@ def body(kind: str) -> bytes:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_compensated(kind: str, tmp_path: Path, cache: Path) -> None:
-    machine = machine_with(kind)
+    machine = ender3_with(kind)
     data = tagged(body(kind))
     result, written = compensated(data, tmp_path, cache, machine)
     assert result.put_back == []
@@ -61,7 +53,7 @@ def test_compensated(kind: str, tmp_path: Path, cache: Path) -> None:
 @pytest.mark.parametrize("kind", ["klipper", *KINDS])
 def test_a_fan_is_switched_where_the_file_says(kind: str, tmp_path: Path, cache: Path) -> None:
     """A straight line at one speed would be a single segment."""
-    machine = load_machine("ender3") if kind == "klipper" else machine_with(kind)
+    machine = ender3_with(kind)
     fans = [(x, f"G1 X{x} E.2\nM106 S{x}\n") for x in range(55, 150, 5)]
     text = "G28\nG90\nM83\nG1 X50 Y50 Z1 F6000\nG1 X50 Y60 F3000\n"
     text += "".join(line for _, line in fans) + "G1 X200 E1\nG1 Y80 E1\n"
@@ -82,8 +74,8 @@ def test_a_move_of_less_than_a_step_alone(kind: str, tmp_path: Path, cache: Path
     """Seen by fuzzing: of a wipe that the motors round away nothing is left but its filament."""
     lines = ("G28", "G90", "M83", "G1 X78.802 Y50 F6000", "G4 P1", "G1 X78.800 Y50 E-.17", "G4 P1")
     data = tagged("\n".join([*lines, "G1 X90 E1", ""]).encode())
-    _, written = compensated(data, tmp_path, cache, machine_with(kind))
-    assert differences(data, written, machine_with(kind)) == []
+    _, written = compensated(data, tmp_path, cache, ender3_with(kind))
+    assert differences(data, written, ender3_with(kind)) == []
 
 
 def test_a_turn_that_the_shaper_makes_shorter_than_marlins_least_move(
@@ -91,13 +83,13 @@ def test_a_turn_that_the_shaper_makes_shorter_than_marlins_least_move(
 ) -> None:
     """Seen by fuzzing: nothing of .1 mm there and back was left to write."""
     text = "G1 X100 Y100 E0\nM221 S95\nG1 Y100.1\nG1 Y100.0\n"
-    result, _ = compensated(text, tmp_path, cache, machine_with("marlin"), method="shaper:ei")
+    result, _ = compensated(text, tmp_path, cache, ender3_with("marlin"), method="shaper:ei")
     (piece,) = result.put_back
     assert piece.reason == "line 3: all moves round to zero at the resolution of a file"
 
 
 def test_marlins_g90_is_followed_by_m83(tmp_path: Path, cache: Path) -> None:
-    _, written = compensated(body("marlin"), tmp_path, cache, machine_with("marlin"))
+    _, written = compensated(body("marlin"), tmp_path, cache, ender3_with("marlin"))
     stream = written.decode().partition("stream on")[2]
     ours = re.findall(r"^G90\nM83\nG1 X", stream, re.MULTILINE)
     assert ours
@@ -105,16 +97,10 @@ def test_marlins_g90_is_followed_by_m83(tmp_path: Path, cache: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_none_keeps_every_byte(kind: str, tmp_path: Path, cache: Path) -> None:
-    _, written = compensated(body(kind), tmp_path, cache, machine_with(kind), method="none")
-    assert written == body(kind)
-
-
-@pytest.mark.parametrize("kind", KINDS)
 def test_plan_and_simulate_agree(kind: str, tmp_path: Path, cache: Path) -> None:
     source = tmp_path / "in.gcode"
     source.write_bytes(body(kind))
-    machine = machine_with(kind)
+    machine = ender3_with(kind)
     planned = plan_file(source, tmp_path / "motion.npz", machine)
     simulated = simulate_file(source, machine, cache_dir=cache)
     assert simulated.time_s == pytest.approx(planned.time_s)
@@ -123,7 +109,7 @@ def test_plan_and_simulate_agree(kind: str, tmp_path: Path, cache: Path) -> None
 
 
 def test_what_a_firmware_cannot_execute_is_refused(tmp_path: Path, cache: Path) -> None:
-    machine = machine_with("marlin")
+    machine = ender3_with("marlin")
     firmware = machine.firmware.model_copy(update={"variant": "bugfix"})
     source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"
     source.write_bytes(body("marlin"))
@@ -143,20 +129,20 @@ def test_a_dialect_that_the_machine_does_not_read_is_refused(tmp_path: Path) -> 
     source.write_bytes(body("marlin"))
     with pytest.raises(ModelError, match=r"ender3 runs Klipper and reads every file as Klipper"):
         plan_file(source, tmp_path / "m.npz", load_machine("ender3"), dialect="marlin")
-    plan_file(source, tmp_path / "m.npz", machine_with("marlin"), dialect="prusa")
+    plan_file(source, tmp_path / "m.npz", ender3_with("marlin"), dialect="prusa")
 
 
 def test_a_file_for_another_firmware_is_doubted(tmp_path: Path, cache: Path) -> None:
     foreign = b"; gcode_flavor = reprapfirmware\nM566 X600 Y600 Z30 E300\n"
     source, data = tmp_path / "in.gcode", foreign + body("reprapfirmware")
     source.write_bytes(data)
-    marlin, motion = machine_with("marlin"), tmp_path / "m.npz"
+    marlin, motion = ender3_with("marlin"), tmp_path / "m.npz"
     (warning,) = plan_file(source, motion, marlin).warnings
     assert "written for reprapfirmware (gcode_flavor = reprapfirmware; " in warning
     assert "ender3 reads it as Marlin does" in warning
     assert "--" not in warning
     assert plan_file(source, motion, marlin, dialect="marlin").warnings == []
-    assert plan_file(source, motion, machine_with("reprapfirmware")).warnings == []
+    assert plan_file(source, motion, ender3_with("reprapfirmware")).warnings == []
     assert simulate_file(source, marlin, cache_dir=cache).warnings[0] == warning
     assert warning in compensated(data, tmp_path, cache, marlin)[0].warnings
 
@@ -171,6 +157,6 @@ def test_a_rest_with_a_feedrate_that_marlin_passes_over(tmp_path: Path, cache: P
     """It has the file's F, not the stream's."""
     lines = ("G28", "G90", "M83", "G1 X50 Y50 F3000", "G1 X90 E1", "G1 E-1 F0", "G1 X60 Y60")
     data = tagged("\n".join([*lines, "G1 E1 F-5", "G1 X90 E1", ""]).encode())
-    result, written = compensated(data, tmp_path, cache, machine_with("marlin"))
+    result, written = compensated(data, tmp_path, cache, ender3_with("marlin"))
     assert result.put_back == []
-    assert differences(data, written, machine_with("marlin")) == []
+    assert differences(data, written, ender3_with("marlin")) == []

@@ -16,7 +16,7 @@ from stillpath.models.store import load_machine
 from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.live_design import cached_live_design
 from stillpath.pipeline.live_printing import simulate_live
-from stillpath.pipeline.options import Options, stamp
+from stillpath.pipeline.options import Options
 from stillpath.pipeline.progress import Cancelled, Progress
 from stillpath.pipeline.result import Result
 from tests.compensating import compensated
@@ -147,10 +147,7 @@ def test_it_may_be_written_in_place_and_cancelled(
         compensate_file(source, source, machine, BOTH, cache_dir=cache, progress=cancel)
     assert source.read_bytes() == PENTAGON
     found = compensate_file(source, source, machine, BOTH, cache_dir=cache)
-    assert [way.file_bytes for way in found.ways] == [
-        source.stat().st_size,
-        len(PENTAGON),
-    ]
+    assert [way.file_bytes for way in found.ways] == [source.stat().st_size, len(PENTAGON)]
 
 
 def test_what_extrudes_nothing_is_judged_by_all_motion(machine: Machine, cache: Path) -> None:
@@ -185,12 +182,6 @@ def test_dry_friction_is_in_what_a_filter_leaves(machine: Machine, cache: Path) 
     assert rubbed["live"].reference_um > clean["live"].reference_um + 10.0
 
 
-def test_the_comparison_is_no_setting_of_the_written_file(machine: Machine) -> None:
-    assert stamp(machine, BOTH) == stamp(machine, Options())
-    assert "compare_live" not in Options().model_dump()
-    assert BOTH.model_dump()["compare_live"] is True
-
-
 @pytest.mark.parametrize(
     ("given", "reason"),
     [
@@ -199,6 +190,8 @@ def test_the_comparison_is_no_setting_of_the_written_file(machine: Machine) -> N
         ({"method": "live", "compare_live": True}, "method live writes none"),
         ({"method": "live", "where": "walls"}, "prints the file as sliced"),
         ({"method": "live", "budget_um": 5.0}, "prints the file as sliced"),
+        ({"method": "advise", "where": "walls"}, "method advise .*where"),
+        ({"budget_um": 5.0, "where": "walls"}, "budget_um"),
     ],
 )
 def test_what_makes_no_sense_together_is_refused(given: dict[str, object], reason: str) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -18,9 +17,8 @@ from stillpath.pipeline.result import Result
 from stillpath.pipeline.simulate import simulate_file
 from stillpath.pipeline.verifying import Verifier
 from tests.compensating import compensated
-from tests.gcode.cutting import HEAD, pieces_of
+from tests.gcode.cutting import HEAD, ender3_with, pieces_of
 
-FIRMWARES = Path(__file__).parents[2] / "examples" / "firmware"
 LINES = "G28\nG90\nM83\nG1 X60 Y60.005 Z5 F1200\n" + "".join(
     f"G1 X{60 + 10 * i} Y60.005 E1 F300\n" for i in range(1, 6)
 )
@@ -28,11 +26,12 @@ LINES = "G28\nG90\nM83\nG1 X60 Y60.005 Z5 F1200\n" + "".join(
 
 
 def machine_with(kind: str) -> Machine:
-    section = json.loads((FIRMWARES / f"{kind}.json").read_text())
+    machine = ender3_with(kind)
     if kind == "reprapfirmware":
-        section["y"]["steps_per_mm"] = 80.0
-    document = load_machine("ender3").model_dump(mode="json")
-    return Machine.model_validate(document | {"firmware": section})
+        y = machine.firmware.y.model_copy(update={"steps_per_mm": 80.0})  # type: ignore[union-attr]
+        firmware = machine.firmware.model_copy(update={"y": y})
+        return machine.model_copy(update={"firmware": firmware})
+    return machine
 
 
 def rms_um(result: Result) -> dict[str, float]:

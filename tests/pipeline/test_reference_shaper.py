@@ -41,12 +41,6 @@ def test_reference_motion_is_a_planner_s() -> None:
     assert np.all(velocity[:, -1] == 0)
 
 
-def test_frequencies() -> None:
-    assert FREQUENCIES_HZ[0] == 20
-    assert FREQUENCIES_HZ[-1] <= 200 < FREQUENCIES_HZ[-1] * 1.02
-    np.testing.assert_allclose(FREQUENCIES_HZ[1:] / FREQUENCIES_HZ[:-1], 1.02)
-
-
 def test_same_optimum_as_brute_force(monkeypatch: pytest.MonkeyPatch) -> None:
     """On a third of the grid and a short motion, every type and pair."""
     monkeypatch.setattr(reference_shaper, "FREQUENCIES_HZ", FREQUENCIES_HZ[::3])

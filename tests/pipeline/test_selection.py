@@ -14,7 +14,6 @@ from stillpath.models.machine import Machine
 from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.result import Result
-from stillpath.service.wrong_options import wrong_option
 from tests.gcode.cutting import ender3_with
 from tests.gcode.plain_reader import Firmware, read
 from tests.gcode.prints import small_arcs
@@ -161,24 +160,6 @@ def test_a_file_that_must_not_be_large(gear: Path, written: Written, tmp_path: P
     assert [p.name for p in tmp_path.iterdir()] == ["out.gcode"]
 
 
-def test_a_budget_is_for_the_whole_print() -> None:
-    from pydantic import ValidationError
-
-    with pytest.raises(ValidationError) as refused:
-        Options(budget_um=10, where="walls")
-    assert "budget_um" in wrong_option(refused.value)
-
-
-@pytest.mark.parametrize("method", ["advise", "none"])
-def test_where_is_for_what_is_compensated(method: str) -> None:
-    from pydantic import ValidationError
-
-    with pytest.raises(ValidationError, match=rf"method {method} .*where") as refused:
-        Options(method=method, where="walls")
-    assert "or use where=all" in wrong_option(refused.value)
-    assert Options(method="none+ripple", where="walls").where == "walls"
-
-
 def test_a_file_that_stays_as_sliced_only_fits_or_not(gear: Path, tmp_path: Path) -> None:
     machine, target = ender3_with("klipper"), tmp_path / "out.gcode"
     found = run(gear, target, machine, method="none", max_mb=10)
@@ -213,9 +194,3 @@ def test_what_has_no_effect_is_told(
     told = [warning for warning in found.warnings if warning.startswith("Without effect: ")]
     assert len(told) == bool(unused)
     assert not unused or f"Without effect: {unused}" in told[0]
-
-
-def test_digests_of_older_options_stay() -> None:
-    assert "where" not in Options().model_dump()
-    assert "max_mb" not in Options().model_dump()
-    assert Options(where="walls").model_dump()["where"] == "walls"

@@ -37,10 +37,8 @@ def job_of(client: TestClient, content: bytes, **query: object) -> dict:
 @pytest.mark.parametrize(
     ("content", "name", "made", "media"),
     [
-        (TEXT, "a.gcode", "a.stillpath.gcode", "text/x.gcode"),
         (binary(TEXT), "a.bgcode", "a.stillpath.bgcode", "application/gcode+binary"),
         (package({1: TEXT}), "a.gcode.3mf", "a.stillpath.gcode.3mf", "model/3mf"),
-        (package({1: TEXT}), "a.b.3MF", "a.b.stillpath.3MF", "model/3mf"),
         (binary(TEXT), "", "upload.stillpath.gcode", "application/gcode+binary"),
     ],
 )

@@ -79,14 +79,3 @@ def test_machines_say_whether_they_can_print_live(client: TestClient) -> None:
     answer = client.get("/v1/machines/mine/stillpath.json")
     assert_problem(answer, 422, "mine runs marlin: only Klipper has print-time compensation")
     assert_problem(client.get("/v1/machines/nobody/stillpath.json"), 404, "nobody")
-
-
-def test_what_makes_no_sense_together_is_refused_before_the_body(client: TestClient) -> None:
-    for query, reason in (
-        ("method=none&compare_live=true", "method none writes none"),
-        ("method=live&where=walls", "method live prints the file as sliced"),
-        ("method=advise&where=walls", "method advise leaves every move as it is"),
-        ("budget_um=5&where=walls", "cannot be combined"),
-    ):
-        answer = client.post(f"/v1/jobs?machine=ender3&{query}", content=b"G1 X1\n")
-        assert_problem(answer, 422, reason)

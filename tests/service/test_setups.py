@@ -1,4 +1,4 @@
-"""The same suite on one computer, and on several: PostgreSQL, S3, Dask's scheduler and workers.
+"""What one computer does, on several: PostgreSQL, S3, Dask's scheduler and workers.
 
 With the real pipeline and real processes; only S3 and the network are pretended.
 """
@@ -42,29 +42,21 @@ def square(layers: int, side_mm: float = 30.0) -> str:
     return "\n".join(lines) + "\n"
 
 
-@pytest.fixture(
-    scope="module",
-    params=["one computer", pytest.param("several", marks=pytest.mark.postgresql)],
-)
+@pytest.fixture(scope="module")
 def site(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+    postgres_server: PostgresServer, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Site]:
     """A service, complete with processes; `environment["ADDRESS"]` says where."""
     folder = tmp_path_factory.mktemp("setup")
     with ExitStack() as stack:
-        if request.param == "one computer":
-            site = Site(folder / "data", keys="false")
-            stack.callback(site.close)
-        else:
-            site = scaled(folder / "data", request, stack)
+        site = scaled(folder / "data", postgres_server, stack)
         serving = stack.enter_context(site.command("serve", "--port", "0"))
         site.environment["ADDRESS"] = serving.said.removeprefix("stillpath: ").strip("/ ")
         yield site
 
 
-def scaled(folder: Path, request: pytest.FixtureRequest, stack: ExitStack) -> Site:
+def scaled(folder: Path, postgres: PostgresServer, stack: ExitStack) -> Site:
     """Start database, storage, scheduler and two workers."""
-    postgres: PostgresServer = request.getfixturevalue("postgres_server")
     patch = stack.enter_context(pytest.MonkeyPatch.context())
     for name, value in CREDENTIALS.items():
         patch.setenv(name, value)

@@ -6,7 +6,6 @@ import os
 import signal
 import socket
 import subprocess
-import sys
 from pathlib import Path
 
 import psutil
@@ -14,24 +13,15 @@ import pytest
 
 from stillpath.service.server import serve_forever
 from stillpath.service.settings import Settings
+from tests.service.test_server import REAL, ROOT
 
 pytestmark = pytest.mark.slow
-
-SERVE = [
-    sys.executable,
-    "-c",
-    "from stillpath.cli.main import main; main()",
-    "serve",
-    "--port",
-    "0",
-]
-ROOT = Path(__file__).resolve().parents[2]
 
 
 def start(data_dir: Path, **settings: str) -> subprocess.Popen[str]:
     given = {f"STILLPATH_{name.upper()}": value for name, value in settings.items()}
     return subprocess.Popen(
-        [*SERVE, "--data-dir", str(data_dir)],
+        [*REAL, str(data_dir)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -12,8 +11,6 @@ from stillpath.service.jobs.state import (
     Cancelled,
     Claimed,
     Event,
-    Failed,
-    Job,
     JobState,
     Lost,
     Progressed,
@@ -54,30 +51,6 @@ def test_progress_never_runs_backwards_nor_over_the_end():
     assert advance(half, Progressed(1, 1.6, "b", 1.2, None)).progress == 1.0
 
 
-def test_a_failure_keeps_its_reason():
-    failed = advance(RUNNING, Failed(1, 2.0, {"status": 422}))
-    assert failed.state is JobState.FAILED
-    assert failed.problem == {"status": 422}
-    assert failed.output is None
-
-
-@pytest.mark.parametrize(
-    "event",
-    [
-        Progressed(1, 2.0, "a", 0.5, None),
-        FINISHED,
-        Failed(1, 2.0, {}),
-        Lost(1, 2.0, "x", 2),
-    ],
-)
-def test_an_earlier_attempt_has_no_say(event: Event):
-    second = advance(advance(RUNNING, Lost(1, 2.0, "killed", 2)), Claimed(3.0, "worker-2"))
-    assert second.attempt == 2
-    for job in (second, advance(RUNNING, FINISHED), advance(RUNNING, Cancelled(2.0))):
-        with pytest.raises(Stale):
-            advance(job, event)
-
-
 def test_a_lost_worker_is_forgiven_once():
     again = advance(RUNNING, Lost(1, 2.0, "killed", 2))
     assert (again.state, again.progress) == (JobState.QUEUED, 0.0)
@@ -95,20 +68,6 @@ def test_a_stopped_service_is_not_the_jobs_fault():
         job = advance(job, Lost(job.attempt, 2.0, "stopped", 2, blame=False))
         job = advance(job, Claimed(3.0, "w"))
     assert (job.state, job.attempt, job.losses) == (JobState.RUNNING, 6, 0)
-
-
-def test_only_a_waiting_job_is_claimed():
-    with pytest.raises(Stale):
-        advance(RUNNING, Claimed(2.0, "w"))
-
-
-@pytest.mark.parametrize("job", [QUEUED, RUNNING])
-def test_a_cancel_is_at_once(job: Job):
-    cancelled = advance(job, Cancelled(5.0))
-    assert (cancelled.state, cancelled.stage) == (JobState.CANCELLED, "cancelled")
-    assert cancelled.finished_at == 5.0
-    with pytest.raises(Stale, match="cancelled already"):
-        advance(cancelled, Cancelled(6.0))
 
 
 @given(st.lists(events(), max_size=30))

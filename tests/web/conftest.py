@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -71,16 +70,18 @@ def gear(service: Service) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="session")
-def artefacts() -> Path:
-    """Folder for screenshots: STILLPATH_ARTEFACTS, else one that the system clears away."""
+def artefacts() -> Path | None:
+    """Folder for screenshots, STILLPATH_ARTEFACTS; without it none are made."""
     named = os.environ.get("STILLPATH_ARTEFACTS")
-    folder = Path(named) if named else Path(tempfile.gettempdir()) / "stillpath-artefacts"
+    if not named:
+        return None
+    folder = Path(named)
     folder.mkdir(parents=True, exist_ok=True)
     return folder
 
 
 @pytest.fixture
-def visitor(browser: Browser, service: Service, artefacts: Path) -> Iterator[Visitor]:
+def visitor(browser: Browser, service: Service, artefacts: Path | None) -> Iterator[Visitor]:
     """No page may log an error or a warning."""
     found = Visitor(browser, service.url, artefacts)
     yield found

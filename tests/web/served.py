@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from typing import Any
 import httpx2
 
 from tests.service.jobs.site import until
+from tests.service.test_server import REAL
 
 __all__ = ["GEAR", "PART", "PATIENCE_MS", "Service", "running"]
 
@@ -22,14 +22,6 @@ ROOT = Path(__file__).resolve().parents[2]
 GEAR = ROOT / "examples" / "cura_ender3_gear24.gcode"
 PART = GEAR.read_bytes().partition(b";LAYER:9\n")[0]
 """Its first nine layers."""
-SERVE = [
-    sys.executable,
-    "-c",
-    "from stillpath.cli.main import main; main()",
-    "serve",
-    "--port",
-    "0",
-]
 PATIENCE_MS = 240_000
 """For whatever a job or an identification takes on a loaded machine."""
 
@@ -66,7 +58,7 @@ def running(data_dir: Path, key: str | None = None, **environment: str) -> Itera
     data_dir.mkdir(parents=True, exist_ok=True)
     with (data_dir / "log").open("w") as log:
         process = subprocess.Popen(
-            [*SERVE, "--data-dir", str(data_dir / "data")],
+            [*REAL, str(data_dir / "data")],
             stdout=subprocess.PIPE, stderr=log, text=True, env=variables, cwd=data_dir,
         )  # fmt: skip
         try:

@@ -57,10 +57,7 @@ def test_the_slider_shows_layer_after_layer(visitor: Visitor, gear: dict[str, An
 def test_neighbours_are_fetched_before_they_are_asked_for(visitor: Visitor, gear: dict[str, Any]):
     page = visitor.open("#/")
     asked: list[int] = []
-    page.on(
-        "request",
-        lambda r: asked.extend(int(n) for n in re.findall(r"/layers/(\d+)$", r.url)),
-    )
+    page.on("request", lambda r: asked.extend(int(n) for n in re.findall(r"/layers/(\d+)$", r.url)))
     page.goto(f"{visitor.url}/#/jobs/{gear['id']}")
     settled(page)
     page.wait_for_load_state("networkidle")

@@ -100,27 +100,18 @@ def test_a_fit_is_kept_under_the_name_it_was_looked_at(
     assert service.api.get("/v1/machines/another").status_code == 404
 
 
-def test_intervals_are_those_of_the_command_line(visitor: Visitor):
+def test_figures_are_written_as_by_command_line_and_reports(visitor: Visitor):
     page = visitor.open()
     module = page.locator("script[type=module]").get_attribute("src") or ""
-    cases = [(47.0, None, 2), (46.9996, 0.0002, 2), (46.9996, 1e-9, 2), (0.0612, 0.0007, 4)]
+    intervals = [(47.0, None, 2), (46.9996, 0.0002, 2), (46.9996, 1e-9, 2), (0.0612, 0.0007, 4)]
+    micrometres = [0.0, 0.994, 9.994, 9.996, 10.04, 99.94, 99.96, 100.4, 1234.6]
     shown = page.evaluate(
-        "async ([from, cases]) => {"
-        " const { interval } = await import(from); return cases.map((c) => interval(...c)); }",
-        [f"/{module.replace('app.js', 'lib/format.js')}", cases],
+        "async ([from, intervals, sizes]) => { const { interval, um } = await import(from);"
+        " return [intervals.map((c) => interval(...c)), sizes.map(um)]; }",
+        [f"/{module.replace('app.js', 'lib/format.js')}", intervals, micrometres],
     )
-    assert shown == [interval_text(*case) for case in cases]
-
-
-def test_micrometres_are_those_of_the_reports(visitor: Visitor):
-    page = visitor.open()
-    module = page.locator("script[type=module]").get_attribute("src") or ""
-    cases = [0.0, 0.994, 9.994, 9.996, 10.04, 99.94, 99.96, 100.4, 1234.6]
-    shown = page.evaluate(
-        "async ([from, cases]) => { const { um } = await import(from); return cases.map(um); }",
-        [f"/{module.replace('app.js', 'lib/format.js')}", cases],
-    )
-    assert shown == [um_text(case) for case in cases]
+    assert shown[0] == [interval_text(*case) for case in intervals]
+    assert shown[1] == [um_text(size) for size in micrometres]
 
 
 def test_a_measurement_that_cannot_be_used_is_named(visitor: Visitor, tmp_path: Path):

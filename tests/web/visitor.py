@@ -20,7 +20,7 @@ class Visitor:
 
     browser: Browser
     url: str
-    artefacts: Path
+    artefacts: Path | None
     complaints: list[str] = field(default_factory=list)
     expected: set[int] = field(default_factory=set)
     """Statuses of answers that the test provokes; browsers log them as errors."""
@@ -45,7 +45,12 @@ class Visitor:
         return page
 
     def shoot(self, page: Page, name: str) -> None:
-        """Keep a screenshot of the whole page, or of the window if a dialog lies over it."""
+        """Keep a screenshot of the whole page, or of the window if a dialog lies over it.
+
+        Only where STILLPATH_ARTEFACTS asks for them: they take much of the time.
+        """
+        if self.artefacts is None:
+            return
         whole = page.locator("dialog[open]").count() == 0
         page.screenshot(path=self.artefacts / f"{name}.png", full_page=whole)
 

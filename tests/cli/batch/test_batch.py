@@ -90,19 +90,6 @@ def test_a_group_of_machines_and_a_map():
     assert states() == {"a@": "failed", "petg_b@annex-k3": "done before"}
 
 
-def test_a_revision_must_be_approved(monkeypatch):
-    store = MachineStore(Path("data/machines"))
-    store.add_revision("mine", make_machine("mine"), author="me", message="")
-    monkeypatch.setenv("STILLPATH_REQUIRE_APPROVAL", "1")
-    fill(a="G28")
-    assert batch("--machine", "mine") == 2
-    row = json.loads(Path("out/summary.json").read_text())["files"][0]
-    assert "approve" in row["error"]
-    assert not Path("out/mine").exists()
-    store.approve("mine", 1, author="boss", message="")
-    assert batch("--machine", "mine") == 0
-
-
 def test_a_new_revision_is_new_work():
     store = MachineStore(Path("data/machines"))
     machine = make_machine("mine")
@@ -114,14 +101,6 @@ def test_a_new_revision_is_new_work():
     store.add_revision("mine", with_accel(machine, 1234.0), author="me", message="")
     assert batch("--machine", "mine") == 0
     assert states() == {"a@mine": "done"}
-
-
-def test_a_file_in_the_way_stays():
-    fill(a="G28")
-    Path("out/ender3").mkdir(parents=True)
-    Path("out/ender3/a.stillpath.gcode").write_text("somebody's")
-    assert batch() == 1
-    assert Path("out/ender3/a.stillpath.gcode").read_text() == "somebody's"
 
 
 def test_names_stay_names():

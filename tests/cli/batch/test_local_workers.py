@@ -14,10 +14,10 @@ from pathlib import Path
 import pytest
 
 from stillpath.service.processes import METHOD, loaded_context
+from tests.service.jobs.site import STILLPATH
 
 ROOT = Path(__file__).parents[3]
 PRINT = "G28\n" + "".join(f"G1 X{20 + 15 * (n % 2)} Y{20 + 5 * n} E{n} F6000\n" for n in range(20))
-COMMAND = [sys.executable, "-c", "from stillpath.cli.main import main; main()"]
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(os.name != "posix", reason="kills processes")]
 
@@ -61,7 +61,7 @@ def files(tmp_path) -> Path:
 def start(folder: Path, *more: str) -> subprocess.Popen[str]:
     arguments = ["batch", str(folder), "-m", "ender3", "-o", str(folder.parent / "out"), *more]
     return subprocess.Popen(
-        [*COMMAND, *arguments],
+        [*STILLPATH, *arguments],
         env=os.environ | {"PYTHONPATH": str(ROOT)},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

@@ -34,16 +34,6 @@ def done(output: OutputFolder, text: str = TEXT) -> Outcome:
     return outcome
 
 
-def test_result_report_and_record(tmp_path):
-    with OutputFolder.opened(tmp_path / "out") as output:
-        outcome = done(output)
-        assert output.recorded(outcome.output) == outcome
-        assert output.is_there(outcome)
-    assert (tmp_path / "out/m/a.stillpath.gcode").read_text() == TEXT
-    assert (tmp_path / "out/reports/m/a.gcode/report.html").exists()
-    assert not list((tmp_path / "out/.stillpath/work").iterdir())
-
-
 def test_what_somebody_changed_stays(tmp_path):
     with OutputFolder.opened(tmp_path) as output:
         outcome = done(output)

@@ -24,7 +24,6 @@ from stillpath.pipeline.result import LastCheckFigures
 from stillpath.service.jobs.problems import problem_of
 from tests.compensating import compensated
 from tests.fuzz.machines import machine_of
-from tests.gcode.container_files import binary, package
 
 ROOT = Path(__file__).parents[3]
 EXAMPLES = sorted((ROOT / "examples").glob("*.gcode"))
@@ -243,15 +242,7 @@ def test_many_streams_without_a_line_that_stays(kind: str, tmp_path: Path, cache
         check(data, twice, machine)
 
 
-@pytest.mark.parametrize(
-    ("path", "kind"),
-    [
-        # Quick: each example with one firmware, each firmware with one example at least.
-        pytest.param(path, kind, id=f"{path.stem}-{kind}", marks=() if here else pytest.mark.slow)
-        for k, path in enumerate(EXAMPLES)
-        for kind, here in ((kind, kind == KINDS[k % len(KINDS)]) for kind in KINDS)
-    ],
-)
+@pytest.mark.parametrize(("path", "kind"), list(zip(EXAMPLES, KINDS, strict=True)), ids=KINDS)
 def test_examples_pass(path: Path, kind: str, tmp_path: Path, cache: Path) -> None:
     data = b"".join(path.read_bytes().splitlines(keepends=True)[:1500])
     result, written = compensated(data, tmp_path, cache, machine_of(kind), method="shaper:mzv")
@@ -259,23 +250,6 @@ def test_examples_pass(path: Path, kind: str, tmp_path: Path, cache: Path) -> No
     assert result.last_check.kept_lines > 20
     assert result.last_check.compared_lines > 1
     assert check(data, written, machine_of(kind)) == result.last_check
-
-
-@pytest.mark.parametrize("pack", [binary, package], ids=["bgcode", "3mf"])
-def test_texts_in_containers_are_compared(pack: object, tmp_path: Path, cache: Path) -> None:
-    name = "in.bgcode" if pack is binary else "in.3mf"
-    text = PRINT.encode()
-    (tmp_path / name).write_bytes(pack(text) if pack is binary else pack({1: text}))  # type: ignore[operator]
-    machine = load_machine("ender3")
-    made = compensate_file(
-        tmp_path / name,
-        tmp_path / f"out-{name}",
-        machine,
-        Options(method="shaper:mzv"),
-        cache_dir=cache,
-    )
-    assert made.last_check is not None
-    assert made.last_check.kept_lines > 15
 
 
 def test_a_file_with_a_fault_is_not_delivered(

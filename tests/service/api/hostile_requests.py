@@ -17,15 +17,8 @@ import httpx2
 import psutil
 
 __all__ = [
-    "CONTROLLERS",
-    "MEASUREMENTS",
-    "SENDER",
-    "Seen",
-    "deep",
-    "hostile_requests",
-    "loop",
-    "spectrum",
-    "watched",
+    *("CONTROLLERS", "MEASUREMENTS", "SENDER", "Seen", "deep", "hostile_requests", "loop"),
+    *("spectrum", "watched"),
 ]
 
 SENDER = [sys.executable, str(Path(__file__).with_name("sender.py"))]

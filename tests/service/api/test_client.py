@@ -8,11 +8,11 @@ import os
 import signal
 import socketserver
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +22,8 @@ from stillpath.cli import main
 from stillpath.service.api.schemas import JobView
 from stillpath.service.client import Client, ClientError
 from tests.integrations.breaking import BODY, TAKES_S, breaking_server
+from tests.service.jobs.site import STILLPATH
 from tests.service.test_server import PRETEND, ROOT, server, until
-
-STILLPATH = [sys.executable, "-c", "from stillpath.cli.main import main; main()"]
 
 
 @pytest.fixture(scope="module")
@@ -109,9 +108,7 @@ def test_cancelling_and_giving_up(client: Client, tmp_path: Path):
     assert client.job(again.id).state == "cancelled"
 
 
-@pytest.mark.parametrize(
-    "address", ["nas:8000", "ftp://nas", "http://", "", "http://[::1", "http://nas:80a0"]
-)
+@pytest.mark.parametrize("address", ["nas:8000", "ftp://nas", "", "http://[::1", "http://nas:80a0"])
 def test_what_is_no_address(address: str):
     with pytest.raises(ClientError, match="http://127"):
         Client(address)
@@ -330,34 +327,34 @@ def test_a_server_that_is_away_is_given_up():
     assert address in str(caught.value)
 
 
-def run(*arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [*STILLPATH, *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        env=os.environ | {"PYTHONPATH": str(ROOT)} | environment,
-        timeout=300,
-        check=False,
-    )
+@pytest.fixture
+def run(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., tuple[int, str, str]]:
+    """Run a command, and return its exit code, stdout and stderr."""
+
+    def ran(*arguments: object, server: str = "") -> tuple[int, str, str]:
+        monkeypatch.setenv("STILLPATH_SERVER", server)
+        return main.run([*map(str, arguments)]), *capsys.readouterr()
+
+    return ran
 
 
-@pytest.mark.slow
-def test_compensate_with_a_server(address: str, tmp_path: Path):
+def test_compensate_with_a_server(address: str, run: Callable[..., Any], tmp_path: Path):
     source = part(tmp_path, "G1 X31\n")
     target = tmp_path / "out.gcode"
     chosen = ("compensate", source, "-m", "ender3", "-o", target)
-    done = run(*chosen, "--server", address, "--report", tmp_path / "report")
-    assert done.returncode == 0, done.stderr
+    code, out, err = run(*chosen, "--server", address, "--report", tmp_path / "report")
+    assert code == 0, err
     assert target.read_text() == "; compensated\nG1 X31\n"
-    assert "contour rms" in done.stdout
+    assert "contour rms" in out
     assert (tmp_path / "report" / "report.html").exists()
     source.write_text("bad\n")
-    done = run(*chosen, STILLPATH_SERVER=address)
-    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
-    assert "X1e400" in done.stderr
+    code, _, err = run(*chosen, server=address)
+    assert (code, "X1e400" in err) == (2, True)
     assert target.read_text() == "; compensated\nG1 X31\n"
-    done = run("jobs", "list", "--server", "nas")
-    assert (done.returncode, "http://127" in done.stderr) == (2, True)
+    code, _, err = run("jobs", "list", "--server", "nas")
+    assert (code, "http://127" in err) == (2, True)
 
 
 def test_a_file_that_somebody_changes_while_a_server_works(
@@ -390,36 +387,30 @@ def test_proxies_that_are_none_are_named(proxy: str, monkeypatch: pytest.MonkeyP
     assert caught.value.exit_code == 2
 
 
-@pytest.mark.slow
-def test_the_commands_of_jobs(address: str, client: Client, tmp_path: Path):
+def test_the_commands_of_jobs(
+    address: str, client: Client, run: Callable[..., Any], tmp_path: Path
+):
     made = client.submit(part(tmp_path, "G1 X41\n"), machine="ender3", batch="cli")
-    assert run("jobs", "wait", made.id, STILLPATH_SERVER=address).returncode == 0
-    listed = run("jobs", "list", "--batch", "cli", STILLPATH_SERVER=address)
-    assert made.id in listed.stdout
-    assert "part.gcode" in listed.stdout
-    shown = json.loads(run("jobs", "show", made.id, STILLPATH_SERVER=address).stdout)
-    assert shown["state"] == "done"
+    there = partial(run, server=address)
+    assert there("jobs", "wait", made.id)[0] == 0
+    listed = there("jobs", "list", "--batch", "cli")[1]
+    assert made.id in listed
+    assert "part.gcode" in listed
+    assert json.loads(there("jobs", "show", made.id)[1])["state"] == "done"
     target = tmp_path / "got.gcode"
-    fetched = run("jobs", "fetch", made.id, "-o", target, STILLPATH_SERVER=address)
-    assert (fetched.returncode, fetched.stdout) == (0, f"{target}\n")
+    assert there("jobs", "fetch", made.id, "-o", target)[:2] == (0, f"{target}\n")
     assert target.read_text() == "; compensated\nG1 X41\n"
-    late = run("jobs", "cancel", made.id, STILLPATH_SERVER=address)
-    assert (late.returncode, "nothing to cancel" in late.stderr) == (2, True)
-    assert run("jobs", "delete", made.id, STILLPATH_SERVER=address).returncode == 0
-    gone = run("jobs", "show", made.id, STILLPATH_SERVER=address)
-    assert (gone.returncode, "no job" in gone.stderr) == (2, True)
-    assert "STILLPATH_SERVER" in run("jobs", "show", made.id).stderr
+    code, _, err = there("jobs", "cancel", made.id)
+    assert (code, "nothing to cancel" in err) == (2, True)
+    assert there("jobs", "delete", made.id)[0] == 0
+    code, _, err = there("jobs", "show", made.id)
+    assert (code, "no job" in err) == (2, True)
+    assert "STILLPATH_SERVER" in run("jobs", "show", made.id)[2]
 
 
 @pytest.mark.skipif(os.name != "posix", reason="sends signals")
-@pytest.mark.parametrize(
-    ("number", "code"),
-    [pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow), (signal.SIGTERM, 143)],
-)
-def test_an_interrupted_command_cancels_its_job(
-    address: str, client: Client, tmp_path: Path, number: int, code: int
-):
-    source = part(tmp_path, f"slow {code}\n")
+def test_an_interrupted_command_cancels_its_job(address: str, client: Client, tmp_path: Path):
+    source = part(tmp_path, "slow\n")
     command = [*STILLPATH, "compensate", str(source), "-m", "ender3", "-o", str(tmp_path / "out")]
     process = subprocess.Popen(
         [*command, "--server", address],
@@ -428,9 +419,9 @@ def test_an_interrupted_command_cancels_its_job(
         env=os.environ | {"PYTHONPATH": str(ROOT)},
     )
     job = until(lambda: next(iter(client.jobs(state=["running"])), None))
-    process.send_signal(number)
+    process.send_signal(signal.SIGTERM)
     _, said = process.communicate(timeout=300)
-    assert process.returncode == code
+    assert process.returncode == 143
     assert "interrupted" in said
     assert until(lambda: client.job(job.id).state == "cancelled")
     assert [path.name for path in tmp_path.iterdir()] == ["part.gcode"]

@@ -66,6 +66,12 @@ def test_who_does_not_wait_gets_the_job_and_asks_again(client: TestClient) -> No
     result = client.get(job["links"]["result"])
     assert result.headers["content-type"] == "application/json"
     assert result.json() == again.json()
+    for page in (
+        client.get(DESIGN.replace("?", ".html?")),
+        client.get(DESIGN, headers={"Accept": "text/html,*/*;q=0.8"}),
+    ):
+        assert page.headers["content-type"].startswith("text/html")
+        assert "Creality Ender 3, axis X" in page.text
     assert_problem(client.get(f"{where}/report"), 404, "design")
     assert job["links"]["report"] is None
     assert [one["id"] for one in jobs(client, "design")] == [job["id"]]
@@ -151,10 +157,3 @@ def test_limits_are_ordinary_failures(tmp_path: Path, limit: dict[str, Any], tit
         assert over(client, post(client, b"nap 1").headers["location"])["state"] == "done"
         (job,) = jobs(client, "design")
         assert (job["state"], job["losses"]) == ("failed", 0)
-
-
-def test_an_owner_has_a_limited_number(tmp_path: Path) -> None:
-    with opened(tmp_path, max_jobs_per_owner=2) as client:
-        for n in (1, 2):
-            assert post(client, f"nap {600 + n}.0".encode()).status_code == 202
-        assert_problem(client.get(DESIGN, headers=AT_ONCE), 429, "cancel")

@@ -21,7 +21,7 @@ from stillpath.service.jobs.store import JobStore
 from stillpath.service.settings import Settings
 from tests.service.api.serving import post
 from tests.service.database.examples import make_job
-from tests.service.test_api import assert_problem, over, until
+from tests.service.test_api import assert_problem, until
 from tests.service.test_server import until as waiting
 
 
@@ -75,14 +75,6 @@ def test_a_deleted_job_ends_the_stream(client: TestClient):
     with once_watched(client, lambda: client.delete(where)):
         assert events(client.get(f"{where}/events").text)[-1]["event"] == "gone"
     assert_problem(client.get(f"{where}/events"), 404)
-
-
-def test_a_cancelled_job_ends_the_stream(client: TestClient):
-    where = post(client, b"slow").headers["location"]
-    with once_watched(client, lambda: client.post(f"{where}/cancel")):
-        last = events(client.get(f"{where}/events").text)[-1]
-    assert json.loads(last["data"])["state"] == "cancelled"
-    assert until(client, where, over)["state"] == "cancelled"
 
 
 def test_heartbeats_are_comments(client: TestClient, monkeypatch: pytest.MonkeyPatch):

@@ -166,8 +166,10 @@ def test_a_job_too_large_for_the_disk_is_told_so(
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="limits the size of files")
-@pytest.mark.parametrize("head", ["Content-Length: 67108864", "Transfer-Encoding: chunked"])
-@pytest.mark.parametrize("limit", ["file", "upload"])
+@pytest.mark.parametrize(
+    ("head", "limit"),
+    [("Content-Length: 67108864", "file"), ("Transfer-Encoding: chunked", "upload")],
+)
 def test_who_only_reads_after_sending_all_hears_why_he_was_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, head: str, limit: str
 ) -> None:

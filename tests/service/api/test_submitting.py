@@ -110,6 +110,10 @@ def test_quotas(tmp_path: Path):
         refused = post(client, b"G1 X1")
         assert_problem(refused, 429, "the limit is 1", "cancel")
         assert refused.headers["retry-after"].isdecimal()
+        design = client.get(
+            "/v1/machines/ender3/design?axis=x", headers={"Prefer": "respond-async"}
+        )
+        assert_problem(design, 429, "cancel")
         client.post(f"{where}/cancel")
         key = {"Idempotency-Key": "k-1"}
         first = post(client, b"slow 2", **key)

@@ -246,10 +246,3 @@ def test_refusals(store, data, tmp_path, monkeypatch, capsys):
     assert run(["backup", str(tmp_path / "b.tar"), "--data-dir", str(data)]) == 2
     assert "pg_dump" in capsys.readouterr().err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["data", "there.tar"]
-
-
-def test_migrate(data, capsys):
-    assert run(["migrate", "--data-dir", str(data)]) == 0
-    assert run(["migrate", "--data-dir", str(data)]) == 0
-    assert (data / "stillpath.sqlite3").exists()
-    assert "schema" in capsys.readouterr().out

@@ -189,18 +189,6 @@ def test_no_job_is_taken_by_two_processes(settings: Settings, store: JobStore):
 
 
 @pytest.mark.slow
-def test_processes_open_a_new_database_at_the_same_time(settings: Settings):
-    workers = [process(settings, "engine.dispose()") for _ in range(4)]
-    assert [line_of(worker) for worker in workers] == ["loaded"] * 4
-    for worker in workers:
-        go(worker)
-    assert [close(worker) for worker in workers] == [0] * 4
-    engine = open_database(settings)
-    assert JobStore(engine).counts()[JobState.QUEUED] == 0
-    engine.dispose()
-
-
-@pytest.mark.slow
 def test_what_was_accepted_survives_a_kill(settings: Settings):
     chance = random.Random(7)
     accepted: list[str] = []

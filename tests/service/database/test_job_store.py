@@ -116,18 +116,6 @@ def test_a_beat_is_a_progress_in_one_statement(store: JobStore, sequence: list[E
         assert getattr(first, name) == getattr(second, name)
 
 
-def test_whoever_lost_the_job_is_told_to_stop(store: JobStore):
-    job = run(store, store.add(make_job()))
-    assert store.beat(job.id, 1, 1501.0, "reading", 0.1, None)
-    store.apply(job.id, Cancelled(1502.0))
-    assert not store.beat(job.id, 1, 1503.0, "reading", 0.2, None)
-    other = run(store, store.add(make_job()))
-    assert store.forget(other.id)
-    assert not store.forget(other.id)
-    assert not store.beat(other.id, 1, 1503.0, "reading", 0.2, None)
-    assert store.apply(other.id, finished(other)) is None
-
-
 def test_what_is_silent(store: JobStore):
     early, late = (store.add(make_job()) for _ in range(2))
     store.add(make_job())
@@ -154,15 +142,6 @@ def test_the_same_request_leads_to_the_same_job(store: JobStore):
     assert sum(store.counts().values()) == 2
     done = store.apply(first.id, finished(run(store, first)))
     assert store.add(make_job(), idempotency=("key", "print")) == done
-
-
-def test_a_request_whose_job_was_deleted_counts_anew(store: JobStore):
-    first = store.add(make_job(), idempotency=("key", "print"))
-    store.forget(first.id)
-    assert store.submitted("anna", "key") == ("print", None)
-    second = store.add(make_job(created_at=2000.0), idempotency=("key", "print"))
-    assert second.id != first.id
-    assert store.submitted("anna", "key") == ("print", second)
 
 
 def test_idempotency_keys_are_kept_by_time_that_passed(store: JobStore):
@@ -204,12 +183,6 @@ def test_a_quota_of_bytes(store: JobStore):
     store.forget(first.id)
     store.add(make_job(), limits=limits)
     assert store.usage("nobody") == (0, 0)
-
-
-def test_the_request_that_came_before_is_answered_beyond_the_quota_too(store: JobStore):
-    limits = Quota(max_jobs=1, max_bytes=10**9)
-    first = store.add(make_job(), idempotency=("key", "print"), limits=limits)
-    assert store.add(make_job(), idempotency=("key", "print"), limits=limits) == first
 
 
 def test_the_same_job(store: JobStore):
@@ -263,18 +236,6 @@ def test_pages_are_newest_first_and_do_not_shift(store: JobStore):
     assert cursor is None
     assert found == newest_first
     assert len(store.page(None, limit=100).jobs) == 15
-
-
-def test_a_page_of_some(store: JobStore):
-    first = store.add(make_job(batch="monday"))
-    second = store.add(make_job(batch="monday"))
-    third = run(store, store.add(make_job()))
-    store.apply(second.id, Cancelled(1500.0))
-    assert store.page("anna", states=[JobState.QUEUED], limit=5).jobs == [first]
-    over = [JobState.RUNNING, JobState.CANCELLED]
-    assert {j.id for j in store.page("anna", states=over, limit=5).jobs} == {second.id, third.id}
-    assert {j.id for j in store.page("anna", batch="monday", limit=5).jobs} == {first.id, second.id}
-    assert store.page("anna", limit=3).next_cursor is None
 
 
 def test_a_cursor_that_no_page_gave(store: JobStore):
@@ -369,16 +330,6 @@ def test_owners_take_turns(store: JobStore):
     assert store.queue_position(running) == 0
 
 
-def test_priority_comes_first(store: JobStore):
-    low, high, later = (
-        store.add(make_job(priority=priority, created_at=at))
-        for priority, at in ((0, 1000.0), (5, 1001.0), (0, 1002.0))
-    )
-    bobs = store.add(make_job(owner="bob", created_at=1003.0))
-    # Anna's urgent job was her turn.
-    assert store.next_queued(9) == [high, bobs, low, later]
-
-
 waiting = st.lists(
     st.tuples(st.sampled_from("abc"), st.integers(-1, 1), st.integers(0, 5)), max_size=12
 )
@@ -442,12 +393,6 @@ def test_who_is_told_of_the_end(store: JobStore):
         assert due(store, job) == {}
 
 
-def test_nobody_asked_to_be_told(store: JobStore):
-    job = run(store, store.add(make_job()))
-    store.apply(job.id, finished(job))
-    assert due(store, job) == {}
-
-
 def test_a_job_does_not_end_without_its_deliveries(store: JobStore):
     job = run(store, store.add(make_job(webhook="https://farm.example")))
     with writing(store.engine) as connection:
@@ -483,10 +428,3 @@ def test_a_lease_of_a_clock_that_was_set_back_since(store: JobStore):
     assert not store.lease("reconciler", "two", 5.0, 9990.0)
     assert store.lease("reconciler", "two", 5.0, 6400.0)
     assert not store.lease("reconciler", "three", 5.0, 6401.0)
-
-
-def test_what_fails_leaves_nothing(store: JobStore):
-    job = store.add(make_job())
-    with pytest.raises(Exception, match=r"(?i)unique"):
-        store.add(job, idempotency=("key", "print"))
-    assert store.submitted("anna", "key") is None

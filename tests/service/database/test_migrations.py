@@ -60,13 +60,6 @@ def test_the_latest_is_the_last():
     assert ScriptDirectory(str(folder)).get_heads() == [LATEST]
 
 
-def test_opening_again_changes_nothing(settings: Settings, engine: Engine):
-    job = JobStore(engine).add(make_job())
-    again = open_database(settings)
-    assert JobStore(again).get(job.id) == job
-    again.dispose()
-
-
 def test_a_migration_that_fails_leaves_nothing(settings: Settings, engine: Engine):
     """As if somebody had made a table of the last migration's by hand."""
     with writing(engine) as connection:
@@ -97,16 +90,8 @@ def test_what_is_no_database(tmp_path: Path):
         open_database(Settings(data_dir=tmp_path))
 
 
-def test_a_server_that_is_not_there(tmp_path: Path):
-    url = "postgresql://anna:geheim@127.0.0.1:1/stillpath"
-    with pytest.raises(StoreError, match=r"127\.0\.0\.1:1/stillpath does not answer") as caught:
-        open_database(Settings(data_dir=tmp_path, database_url=url))
-    assert "geheim" not in str(caught.value)
-
-
 @pytest.mark.parametrize(
-    ("given", "words"),
-    [("nonsense", "not an address"), ("mysql://host/x", "begins with mysql")],
+    ("given", "words"), [("nonsense", "not an address"), ("mysql://host/x", "begins with mysql")]
 )
 def test_an_address_of_something_else(tmp_path: Path, given: str, words: str):
     with pytest.raises(StoreError, match=f"STILLPATH_DATABASE_URL .*{words}"):

@@ -47,109 +47,85 @@ def test_a_printer_as_its_machine_says(tmp_path: Path, name: str):
     assert found.machine_revision == machine.revision
 
 
-def _kinematics(status: dict[str, Any]) -> None:
-    settings_of(status)["printer"]["kinematics"] = "limited_cartesian"
+def changed(status: dict[str, Any], **values: Any) -> dict[str, Any]:
+    """Set what stands at paths like `toolhead__max_accel`."""
+    for path, value in values.items():
+        *folders, name = path.split("__")
+        place = status
+        for folder in folders:
+            place = place.setdefault(folder, {})
+        place[name] = value
+    return status
 
 
-def _slower_z(status: dict[str, Any]) -> None:
-    settings_of(status)["printer"]["max_z_accel"] *= 0.5
+KINEMATICS = {"configfile__settings__printer__kinematics": "limited_cartesian"}
+RAISED = {"toolhead__max_accel": 300_000.0}
+NOT_WRAPPED = {"gcode__commands__PAUSE__help": "Pause the actual running print"}
+OWN_LIMIT_MACRO = {"configfile__config__gcode_macro Set_Velocity_Limit": {}}
+OWN_SHAPER_MACRO = {"configfile__config__gcode_macro SET_INPUT_SHAPER": {}}
 
 
-def _faster_z(status: dict[str, Any]) -> None:
-    settings_of(status)["printer"]["max_z_accel"] *= 2.0
+def set_everywhere(section: str, name: str, value: float, place: str) -> dict[str, float]:
+    """In printer.cfg and in force."""
+    return {f"configfile__settings__{section}__{name}": value, f"{place}__{name}": value}
 
 
-def _configured_accel(status: dict[str, Any]) -> None:
-    settings_of(status)["printer"]["max_accel"] = 1234.0
-    status["toolhead"]["max_accel"] = 1234.0
-
-
-def _raised(status: dict[str, Any]) -> None:
-    status["toolhead"]["max_accel"] = 300_000.0
-
-
-def _raised_by_a_print(status: dict[str, Any]) -> None:
-    _raised(status)
-    status["print_stats"]["state"] = "paused"
-
-
-def _lowered(status: dict[str, Any]) -> None:
-    status["toolhead"]["max_accel"] = 100.0
-
-
-def _shaper(status: dict[str, Any]) -> None:
-    settings_of(status).setdefault("input_shaper", {})["shaper_freq_x"] = 61.5
-
-
-def _corner(status: dict[str, Any]) -> None:
-    settings_of(status)["printer"]["square_corner_velocity"] = 8.0
-    status["toolhead"]["square_corner_velocity"] = 8.0
-
-
-def _advance(status: dict[str, Any]) -> None:
-    settings_of(status)["extruder"]["pressure_advance"] = 0.123
-    status["extruder"]["pressure_advance"] = 0.123
-
-
-def _advance_in_force(status: dict[str, Any]) -> None:
-    status["extruder"]["pressure_advance"] = 0.321
-
-
-def _own_limit_macro(status: dict[str, Any]) -> None:
-    status["configfile"]["config"]["gcode_macro Set_Velocity_Limit"] = {}
-
-
-def _own_shaper_macro(status: dict[str, Any]) -> None:
-    status["configfile"]["config"]["gcode_macro SET_INPUT_SHAPER"] = {}
-
-
-def _not_wrapped(status: dict[str, Any]) -> None:
-    status["gcode"]["commands"]["PAUSE"]["help"] = "Pause the actual running print"
-
-
-def _m600(status: dict[str, Any]) -> None:
-    status["gcode"]["commands"]["M600"] = {"help": "G-Code macro"}
-
-
-def _old_klipper(status: dict[str, Any]) -> None:
+def of_old_klipper(status: dict[str, Any], *, in_order: bool) -> dict[str, Any]:
     del status["gcode"]
-
-
-def _old_klipper_in_wrong_order(status: dict[str, Any]) -> None:
-    _old_klipper(status)
     macros = status["configfile"]["config"]
-    macros["gcode_macro PAUSE"] = macros.pop("gcode_macro PAUSE")
-
-
-def _travel(status: dict[str, Any]) -> None:
-    settings_of(status)["stepper_x"]["position_max"] -= 10.0
+    if not in_order:
+        macros["gcode_macro PAUSE"] = macros.pop("gcode_macro PAUSE")
+    return status
 
 
 @pytest.mark.parametrize(
     ("change", "place", "words", "unsafe"),
     [
-        (_kinematics, "[printer] kinematics", "limited_cartesian", True),
-        (_slower_z, "[printer] max_z_accel", "no command raises", True),
-        (_faster_z, "[printer] max_z_accel", "put ", False),
-        (_configured_accel, "[printer] max_accel", "1234", False),
-        (_raised, "max_accel", "300000, printer.cfg says", True),
-        (_lowered, "max_accel", "STILLPATH_RESTORE", False),
-        (_shaper, "[input_shaper] shaper_freq_x", "61.5", False),
-        (_corner, "[printer] square_corner_velocity", "8", False),
-        (_advance, "[extruder] pressure_advance", "0.123", False),
-        (_advance_in_force, "pressure_advance", "0.321", False),
-        (_own_limit_macro, "SET_VELOCITY_LIMIT", "take it out", True),
-        (_own_shaper_macro, "SET_INPUT_SHAPER", "on top of", False),
-        (_not_wrapped, "PAUSE", "include stillpath.cfg", False),
-        (_m600, "M600", "include stillpath-m600.cfg", False),
-        (_old_klipper, "CANCEL_PRINT", "include stillpath.cfg", False),
-        (_old_klipper_in_wrong_order, "PAUSE, CANCEL_PRINT", "after your own", False),
-        (_travel, "[stepper_x] position_max", "travel.x.max_mm", False),
+        (KINEMATICS, "[printer] kinematics", "limited_cartesian", True),
+        (RAISED, "max_accel", "300000, printer.cfg says", True),
+        ({"toolhead__max_accel": 100.0}, "max_accel", "STILLPATH_RESTORE", False),
+        (NOT_WRAPPED, "PAUSE", "include stillpath.cfg", False),
+        (OWN_LIMIT_MACRO, "SET_VELOCITY_LIMIT", "take it out", True),
+        (OWN_SHAPER_MACRO, "SET_INPUT_SHAPER", "on top of", False),
+        (
+            {"configfile__settings__printer__max_z_accel": 1.0},
+            *("[printer] max_z_accel", "no command raises", True),
+        ),
+        (
+            {"configfile__settings__printer__max_z_accel": 1e6},
+            *("[printer] max_z_accel", "put ", False),
+        ),
+        (
+            set_everywhere("printer", "max_accel", 1234.0, "toolhead"),
+            *("[printer] max_accel", "1234", False),
+        ),
+        (
+            set_everywhere("printer", "square_corner_velocity", 8.0, "toolhead"),
+            *("[printer] square_corner_velocity", "8", False),
+        ),
+        (
+            set_everywhere("extruder", "pressure_advance", 0.123, "extruder"),
+            *("[extruder] pressure_advance", "0.123", False),
+        ),
+        ({"extruder__pressure_advance": 0.321}, "pressure_advance", "0.321", False),
+        (
+            {"configfile__settings__input_shaper__shaper_freq_x": 61.5},
+            *("[input_shaper] shaper_freq_x", "61.5", False),
+        ),
+        (
+            {"gcode__commands__M600": {"help": "G-Code macro"}},
+            *("M600", "include stillpath-m600.cfg", False),
+        ),
+        (
+            {"configfile__settings__stepper_x__position_max": 100.0},
+            *("[stepper_x] position_max", "travel.x.max_mm", False),
+        ),
     ],
 )
-def test_what_differs_is_found(tmp_path: Path, change, place: str, words: str, unsafe: bool):
-    status = status_of(MACHINE)
-    change(status)
+def test_what_differs_is_found(
+    tmp_path: Path, change: dict[str, Any], place: str, words: str, unsafe: bool
+):
+    status = changed(status_of(MACHINE), **change)
     found = {finding.place: finding for finding in checked(tmp_path, status).findings}
     assert place in found, list(found)
     assert words in found[place].text
@@ -157,13 +133,24 @@ def test_what_differs_is_found(tmp_path: Path, change, place: str, words: str, u
 
 
 @pytest.mark.parametrize(
+    ("in_order", "place", "words"),
+    [
+        (True, "CANCEL_PRINT", "include stillpath.cfg"),
+        (False, "PAUSE, CANCEL_PRINT", "after your own"),
+    ],
+)
+def test_an_old_klipper_shows_no_commands(tmp_path: Path, in_order: bool, place: str, words: str):
+    status = of_old_klipper(status_of(MACHINE), in_order=in_order)
+    found = {finding.place: finding for finding in checked(tmp_path, status).findings}
+    assert (words in found[place].text, found[place].unsafe) == (True, False)
+
+
+@pytest.mark.parametrize(
     ("software", "kept"),
     [
         ("v0.13.0-630-ge4c4a5b94", False),
         ("v0.13.0-631-gdb10e92e9", True),
-        ("v0.13.0-641-g2239041df-dirty", True),
         ("v0.13.0-642-g77d5d942e", False),
-        ("v0.14.0-635-g0123456", False),
         ("?", False),
     ],
 )
@@ -191,16 +178,13 @@ def test_a_klipper_that_cannot_switch_its_shaper_off(tmp_path: Path, software: s
 
 
 def test_limits_of_a_print_under_way_are_its_own(tmp_path: Path):
-    status = status_of(MACHINE)
-    _raised_by_a_print(status)
+    status = changed(status_of(MACHINE), **RAISED, print_stats__state="paused")
     assert checked(tmp_path, status).findings == []
 
 
 @pytest.mark.parametrize("method", ["none", "advise"])
 def test_a_file_without_a_stream_needs_no_macros(tmp_path: Path, method: str):
-    status = status_of(MACHINE)
-    for change in (_not_wrapped, _own_limit_macro, _own_shaper_macro):
-        change(status)
+    status = changed(status_of(MACHINE), **NOT_WRAPPED, **OWN_LIMIT_MACRO, **OWN_SHAPER_MACRO)
     found = {finding.place for finding in checked(tmp_path, status, method=method).findings}
     assert found <= {"[input_shaper]"}
 
@@ -251,8 +235,7 @@ def test_a_damaged_memory_is_named(tmp_path: Path):
     checked(tmp_path, status_of(MACHINE))
     [file] = tmp_path.rglob("*.json")
     file.write_text("{}")
-    status = status_of(MACHINE)
-    _kinematics(status)
+    status = changed(status_of(MACHINE), **KINEMATICS)
     unsafe, damaged = checked(tmp_path, status).findings
     assert unsafe.unsafe  # all the same
     assert re.search(r"left/\w+\.json is damaged; delete it", damaged.text)
@@ -261,8 +244,7 @@ def test_a_damaged_memory_is_named(tmp_path: Path):
 
 def test_a_memory_that_cannot_be_written_is_named(tmp_path: Path):
     (tmp_path / "left").write_text("where its folder would be")
-    status = status_of(MACHINE)
-    _kinematics(status)
+    status = changed(status_of(MACHINE), **KINEMATICS)
     unsafe, unwritten = checked(tmp_path, status).findings
     assert unsafe.unsafe
     assert "left cannot be remembered" in unwritten.text
@@ -284,8 +266,8 @@ def test_a_klipper_that_is_not_ready(tmp_path: Path, state: str, words: str):
 
 @pytest.mark.parametrize(
     "body",
-    [b"", b"[]", b"<html>", b'{"result": 1}', b'{"result": {"state": "ready"}}', b"[" * 50_000],
-    ids=["empty", "list", "page", "number", "half", "deep"],
+    [b"<html>", b'{"result": {"state": "ready"}}', b"[" * 50_000],
+    ids=["page", "half", "deep"],
 )
 def test_answers_that_are_not_moonrakers(tmp_path: Path, body: bytes):
     with (
@@ -328,24 +310,21 @@ def _checker(place: Place) -> Checker:
     return Checker(DocumentFolder(place.settings.data_dir / "printers"))
 
 
-@pytest.mark.parametrize("prints", [False, True])
-def test_a_sound_printer_gets_its_file_without_a_word(tmp_path: Path, prints: bool):
-    delivery, [upload] = delivered(tmp_path, status_of(MACHINE), print_after=prints)
+def test_a_sound_printer_gets_its_file_without_a_word(tmp_path: Path):
+    delivery, [upload] = delivered(tmp_path, status_of(MACHINE), print_after=True)
     assert (delivery.state, delivery.error) == ("done", None)
-    assert upload.parts()["print"][1] == (b"true" if prints else b"false")
+    assert upload.parts()["print"][1] == b"true"
 
 
 def test_what_differs_is_noted_and_the_print_begins(tmp_path: Path):
-    status = status_of(MACHINE)
-    _not_wrapped(status)
+    status = changed(status_of(MACHINE), **NOT_WRAPPED)
     delivery, [upload] = delivered(tmp_path, status, print_after=True)
     assert (delivery.state, upload.parts()["print"][1]) == ("done", b"true")
     assert "stillpath.cfg" in delivery.error
 
 
 def test_what_is_unsafe_is_uploaded_and_not_started(tmp_path: Path):
-    status = status_of(MACHINE)
-    _kinematics(status)
+    status = changed(status_of(MACHINE), **KINEMATICS)
     delivery, [upload] = delivered(tmp_path, status, print_after=True)
     assert (delivery.state, upload.parts()["print"][1]) == ("done", b"false")
     assert delivery.error.startswith("uploaded, but not started, because it may be unsafe; ")
@@ -417,7 +396,7 @@ def test_on_the_command_line(tmp_path: Path, monkeypatch, capsys):
         command = ["printers", "check", "left", "--printers", str(file)]
         assert run(command) == 0
         assert "as the machine ender3 says" in capsys.readouterr().out
-        _kinematics(status)
+        changed(status, **KINEMATICS)
         assert run(command) == 2
         assert capsys.readouterr().out.startswith("unsafe: [printer] kinematics")
         accept = ["printers", "accept", "left", "--printers", str(file)]

@@ -55,20 +55,6 @@ def test_who_asked_is_told_that_a_job_is_over(tmp_path: Path):
     assert "result" not in told[failed.id][1]["job"]["links"]
 
 
-def test_a_server_that_is_down_gets_it_once_it_is_up(tmp_path: Path):
-    with Listener() as listener:
-        port = listener.port
-    with open_place(tmp_path / "data", webhook_targets=[f"127.0.0.1:{port}"]) as place:
-        job = place.fail(webhook=f"http://127.0.0.1:{port}/")
-        with place.sending(attempts=1000, first_wait_s=0.01):
-            until(lambda: place.delivery(job).attempts >= 2)
-            assert "cannot be reached" in (place.delivery(job).error or "")
-            with Listener(port=port) as listener:
-                assert place.settled(job).state == "done"
-                assert place.delivery(job).error is None
-                assert len(listener.seen) == 1
-
-
 def test_the_same_body_is_sent_again_with_the_same_delivery(tmp_path: Path):
     answers = iter([503, 500, 429, 200])
     with (
@@ -250,13 +236,6 @@ def test_a_claim_holds_although_the_clock_is_set_back(
         with place.sending(claim_s=1.5), place.sending(claim_s=1.5):
             assert place.settled(job).state == "done"
         assert len(listener.seen) == 1
-
-
-def test_a_deleted_jobs_delivery_goes_with_it(place: Place):
-    job = place.fail(webhook="http://127.0.0.1:1/")
-    place.store.forget(job.id)
-    with pytest.raises(KeyError):
-        place.delivery(job)
 
 
 def test_the_row_of_a_deleted_job_is_not_taken_for_the_next_one(place: Place):

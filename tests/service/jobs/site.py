@@ -24,9 +24,10 @@ from stillpath.service.settings import Settings
 from stillpath.service.storage.factory import open_storage
 from tests.service.database.examples import make_job
 
-__all__ = ["ROOT", "Process", "Site", "until"]
+__all__ = ["ROOT", "STILLPATH", "Process", "Site", "until"]
 
 ROOT = Path(__file__).resolve().parents[3]
+STILLPATH = [sys.executable, "-c", "from stillpath.cli.main import main; main()"]
 WORK = [sys.executable, str(Path(__file__).with_name("work_process.py"))]
 PATIENCE_S = 600.0
 
@@ -136,8 +137,7 @@ class Site:
     @contextlib.contextmanager
     def command(self, *arguments: str, **settings: Any) -> Iterator[Process]:
         """Run a command of `stillpath`."""
-        main = [sys.executable, "-c", "from stillpath.cli.main import main; main()"]
-        with self.process([*main, *arguments], **settings) as process:
+        with self.process([*STILLPATH, *arguments], **settings) as process:
             yield process
 
     @contextlib.contextmanager

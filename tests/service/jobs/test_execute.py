@@ -13,7 +13,7 @@ import pytest
 
 from stillpath.pipeline.progress import Progress
 from stillpath.service.jobs import worker
-from stillpath.service.jobs.state import WAITING_FOR_ROOM, Cancelled, Job, JobState, Lost
+from stillpath.service.jobs.state import WAITING_FOR_ROOM, Job, JobState, Lost
 from stillpath.service.jobs.watch import STUCK_EXIT_CODE
 from stillpath.service.jobs.worker import Workplace, execute
 from stillpath.service.storage import StorageError
@@ -45,13 +45,6 @@ class Bench:
         return self.site.get(job_id)
 
 
-def test_a_job_is_done(site: Site):
-    job = Bench(site).run(site.submit("G1 X1"))
-    assert (job.state, job.attempt, job.progress) == (JobState.DONE, 1, 1.0)
-    assert job.summary["after_um"] == 20.0
-    site.check_files()
-
-
 def test_a_job_is_claimed_once(site: Site):
     job_id = site.submit("G1 X1")
     first = Bench(site).run(job_id)
@@ -72,14 +65,6 @@ def during(job_id: str, site: Site, act: Any) -> Thread:
     thread = Thread(target=lambda: (site.running(job_id), act()))
     thread.start()
     return thread
-
-
-def test_a_cancel_stops_the_work(site: Site):
-    job_id = site.submit("slow")
-    thread = during(job_id, site, lambda: site.cancel(job_id))
-    assert Bench(site).run(job_id).state is JobState.CANCELLED
-    thread.join()
-    site.check_files()
 
 
 def test_a_deleted_job_stops_the_work(site: Site):
@@ -148,21 +133,6 @@ def test_a_worker_that_is_stopped_gives_its_job_back(site: Site):
     job = bench.run(job_id)
     thread.join()
     assert (job.state, job.losses) == (JobState.QUEUED, 0)
-
-
-def test_too_long_is_a_failure_that_names_the_limit(site: Site):
-    job = Bench(site, {"max_job_s": 0.1}).run(site.submit("slow"))
-    assert job.state is JobState.FAILED
-    assert "STILLPATH_MAX_JOB_S" in job.problem["detail"]
-    site.check_files()
-
-
-def test_too_large_is_a_failure_that_names_the_limit_and_ends_the_process(site: Site):
-    bench = Bench(site, {"max_job_bytes": 10 << 20})
-    job = bench.run(site.submit("slow"))
-    assert job.state is JobState.FAILED
-    assert "STILLPATH_MAX_JOB_BYTES" in job.problem["detail"]
-    assert bench.ends == [0]
 
 
 def test_a_runner_that_does_not_listen_costs_its_process(site: Site):
@@ -241,8 +211,3 @@ def test_what_is_left_of_the_disk_belongs_to_the_database(site: Site):
     bench = Bench(site, limits={"disk_reserve_bytes": everything})
     job = bench.run(site.submit("slow"))
     assert (job.state, job.stage) == (JobState.QUEUED, WAITING_FOR_ROOM)
-
-
-def test_a_cancel_of_a_job_that_is_over_is_too_late(site: Site):
-    job = Bench(site).run(site.submit("G1"))
-    assert site.store.apply(job.id, Cancelled(time.time())) is None

@@ -9,22 +9,15 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from pathlib import Path
 
 import psutil
 import pytest
 
-from stillpath.applications.machines.resolve import PinnedMachine
-from stillpath.models.store import load_machine
 from stillpath.service.database.engine import DatabaseAway
 from stillpath.service.jobs.state import JobState
-from tests.service.jobs.site import ROOT, Process, Site, until
-from tests.service.small_disk import small_disk
+from tests.service.jobs.site import Site, until
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(os.name != "posix", reason="kills processes"),
-]
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(os.name != "posix", reason="kills processes")]
 
 
 @pytest.fixture(scope="module")
@@ -91,15 +84,6 @@ def test_a_service_that_is_stopped_gives_its_jobs_back(site: Site, to: str):
     site.check_files()
 
 
-def test_a_cancel_frees_the_worker(shared: Site):
-    slow = shared.submit("slow")
-    pid = worker_pid(shared, slow)
-    shared.cancel(slow)
-    job = shared.ended(shared.submit("G1"))
-    assert job.state is JobState.DONE  # there is one place for such jobs
-    assert psutil.pid_exists(pid)
-
-
 def test_a_worker_that_is_deaf_to_a_cancel_is_ended(shared: Site):
     deaf = shared.submit("deaf")
     pid = worker_pid(shared, deaf)
@@ -134,23 +118,6 @@ def test_silence_is_a_loss(site: Site):
     site.check_files()
 
 
-def test_a_job_larger_than_the_disk_fails_and_others_go_on(tmp_path: Path):
-    with small_disk(tmp_path / "disk", 24) as disk:
-        site = Site(disk / "data", disk_reserve_bytes=str(4 << 20))
-        try:
-            with site.work():
-                small, large = site.submit("G1"), site.submit("long 100")
-                after = site.submit("G1")
-                assert site.ended(small).state is JobState.DONE
-                assert site.ended(after).state is JobState.DONE
-                job = site.ended(large)
-                assert (job.state, job.losses) == (JobState.FAILED, 0)
-                assert job.problem["title"] == "The job is larger than the disk"
-            site.check_files()
-        finally:
-            site.close()
-
-
 def test_ends_at_random_moments_leave_every_job_done_once(site: Site):
     """Kill and start the service again and again, while jobs come in."""
     ids: list[str] = []
@@ -180,28 +147,6 @@ def test_ends_at_random_moments_leave_every_job_done_once(site: Site):
     site.check_files()
 
 
-def test_the_real_road_survives_the_death_of_its_worker(site: Site):
-    source = ROOT / "examples" / "ps_ender3_pauses_hept24f.gcode"
-    main = [
-        sys.executable,
-        "-c",
-        "from stillpath.cli.main import main; main()",
-        "serve",
-        "--port",
-        "0",
-    ]
-    with site.process(main) as process:
-        job_id = site.submit(source.read_text(), PinnedMachine(machine=load_machine("ender3")))
-        job = until(lambda: (j := site.running(job_id)).stage == "compensating" and j)
-        os.kill(worker_pid_of(job.worker), signal.SIGKILL)
-        job = site.ended(job_id, 600)
-        assert (job.state, job.attempt) == (JobState.DONE, 2), job.problem
-        assert job.summary["after_um"] < job.summary["before_um"]
-        assert _is_alive(process)
-    names = {stat.key.split("/", 3)[3] for stat in site.storage.list(f"{job.output}/")}
-    assert names > {"report/report.html", "report/report.json", f"result/{job.result_name}"} - {""}
-
-
 def worker_pid_of(name: str | None) -> int:
     assert name is not None
     return int(name.rsplit(":", 1)[1])
@@ -211,7 +156,3 @@ def _lives(process: psutil.Process) -> bool:
     with contextlib.suppress(psutil.NoSuchProcess):
         return process.is_running() and process.status() != psutil.STATUS_ZOMBIE
     return False
-
-
-def _is_alive(process: Process) -> bool:
-    return psutil.pid_exists(process.pid)

@@ -31,8 +31,7 @@ def is_granted(limits: Limits, who: str) -> bool:
 
 
 @given(
-    per_minute=st.integers(1, 600),
-    pauses_s=st.lists(st.floats(0, 30), min_size=1, max_size=300),
+    per_minute=st.integers(1, 600), pauses_s=st.lists(st.floats(0, 30), min_size=1, max_size=300)
 )
 def test_never_more_than_a_bucket_and_its_filling(per_minute: int, pauses_s: list[float]):
     clock = Clock()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stillpath.service.security.masking import mask, mask_secrets
+from tests.service.test_server import REAL
 
 ROOT = Path(__file__).resolve().parents[3]
 KEY = "sp_" + "Ab0_-9" * 6
@@ -24,18 +24,11 @@ SECRETS = st.from_regex(r"[A-Za-z0-9_-]{32,60}", fullmatch=True)
 @pytest.mark.parametrize(
     "text",
     [
-        "key {}",
-        "X-Api-Key: {}",
-        "'x-api-key': '{}'",
-        "(b'x-api-key', b'{}')",
-        "Authorization: Bearer {}",
-        "{{'authorization': 'Bearer {}'}}",
-        "(b'authorization', b'Bearer {}')",
-        "Authorization: Basic {}",
-        "GET /v1/jobs?api_key={}&x=1",
-        "https://h/x?a=1&token={}",
-        "https://h/x?webhook_secret={}#y",
-        "postgresql+psycopg://user:{}@host/db",
+        *("key {}", "X-Api-Key: {}", "'x-api-key': '{}'", "(b'x-api-key', b'{}')"),
+        *("Authorization: Bearer {}", "{{'authorization': 'Bearer {}'}}"),
+        *("(b'authorization', b'Bearer {}')", "Authorization: Basic {}"),
+        *("GET /v1/jobs?api_key={}&x=1", "https://h/x?a=1&token={}"),
+        *("https://h/x?webhook_secret={}#y", "postgresql+psycopg://user:{}@host/db"),
         "cannot reach http://{}@host:80/",
     ],
 )
@@ -79,7 +72,6 @@ def test_a_real_services_logs_hold_no_secret(tmp_path: Path):
         f"api_key = '{password}'\nmachine = 'ender3'\n"
     )
     environment = os.environ | {
-        "STILLPATH_DATA_DIR": str(tmp_path / "data"),
         "STILLPATH_KEYS": "true",
         "STILLPATH_FIRST_KEY": first,
         "STILLPATH_WEBHOOK_SECRET": secret,
@@ -88,14 +80,7 @@ def test_a_real_services_logs_hold_no_secret(tmp_path: Path):
     }
     with (tmp_path / "log").open("wb") as log:
         process = subprocess.Popen(
-            [
-                sys.executable,
-                "-c",
-                "from stillpath.cli.main import main; main()",
-                "serve",
-                "--port",
-                "0",
-            ],
+            [*REAL, str(tmp_path / "data")],
             cwd=ROOT,
             env=environment,
             stdout=subprocess.PIPE,

@@ -101,40 +101,28 @@ def test_a_prefix_is_a_folder_and_no_beginning_of_a_name(storage: Storage, tmp_p
     assert {found.key for found in storage.list("jobs/")} == {"jobs/ab/1"}
 
 
-@pytest.mark.parametrize(
-    "key",
-    [
-        "../x",
-        "jobs/../../x",
-        "/etc/passwd",
-        "jobs//x",
-        "",
-        "jobs/./x",
-        "a\\b",
-        "C:x",
-        "a\0b",
-        "x" * 999,
-    ],
+ODD_KEYS = (
+    *("../x", "jobs/../../x", "/etc/passwd", "jobs//x", "", "jobs/./x", "a\\b", "C:x", "a\0b"),
+    "x" * 999,
 )
-def test_a_key_never_leads_out(storage: Storage, key: str, tmp_path: Path):
+
+
+def test_a_key_never_leads_out(storage: Storage, tmp_path: Path):
     file = tmp_path / "file"
     file.write_bytes(b"x")
-    with pytest.raises(ValueError, match="not a key"):
-        storage.put(key, file)
-    with pytest.raises(ValueError, match="not a key"):
-        storage.stat(key)
-    with pytest.raises(ValueError, match=r"not a key|not a prefix"):
-        storage.delete(key + "/")
+    for key in ODD_KEYS:
+        with pytest.raises(ValueError, match="not a key"):
+            storage.put(key, file)
+        with pytest.raises(ValueError, match="not a key"):
+            storage.stat(key)
+        with pytest.raises(ValueError, match=r"not a key|not a prefix"):
+            storage.delete(key + "/")
     assert file.exists()
 
 
 def test_a_prefix_needs_its_slash(storage: Storage):
     with pytest.raises(ValueError, match="must end with"):
         storage.delete("jobs/a")
-
-
-def test_a_storage_that_works_says_so(storage: Storage):
-    storage.check()
 
 
 def test_a_reader_sees_the_old_file_or_the_new_one(storage: Storage, tmp_path: Path):
