@@ -156,7 +156,6 @@ def limited(design: PreviewDesign, path: Array, z: Array | None = None) -> Array
 
     Parameters
     ----------
-    design : PreviewDesign
     path : ndarray, shape (windows * update + window - update,)
         Planned positions, up to the end of the last window's preview.
     z : ndarray, shape (nz,), optional
@@ -189,11 +188,9 @@ def full_ce_opt(
 
     Parameters
     ----------
-    plant : DiscretePlant
     path : ndarray, shape (axes, n)
     share : float
         Functions per sample.
-    price : float
     q : int
         Sharpness of the cut-off.
     """
@@ -221,11 +218,9 @@ def full_bsplines(plant: DiscretePlant, path: Array, spacing: float, price: floa
 
     Parameters
     ----------
-    plant : DiscretePlant
     path : ndarray, shape (axes, n)
     spacing : float
         Samples from knot to knot.
-    price : float
     """
     degree = 3
     b, a = _fraction(plant)

@@ -319,7 +319,6 @@ def _tied_problem(
 
     Parameters
     ----------
-    functions : Functions
     z, targets, weight
         As in `compensation.window_problem.solve_window`.
     moving : ndarray of int64, shape (k, 2)

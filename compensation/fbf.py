@@ -88,7 +88,6 @@ class PreviewFbf:
     ----------
     lifted : tuple of LiftedWindow
         Plants and weights for which X and Y are designed.
-    along : float
     rungs : tuple of int
         Rungs of the ladders (`LADDER`, within the models' bands) used by the last command, X and Y.
 

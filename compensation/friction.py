@@ -68,7 +68,6 @@ class FrictionCompensator(Overlay):
         Compensates vibration: its command is what the axes should receive.
     machine : Machine
         With friction in its axes.
-    dt_s : float
     """
 
     def __init__(self, inner: Compensator, machine: Machine, dt_s: float) -> None:

@@ -194,7 +194,6 @@ class FullPreview:
         Parameters
         ----------
         y_d : array_like, shape (rows,)
-        counts : sequence of int
 
         Returns
         -------
@@ -288,7 +287,6 @@ def independence(plant: DiscretePlant, basis: Array, states: Array | None = None
 
     Parameters
     ----------
-    plant : DiscretePlant
     basis : ndarray, shape (m, n)
     states : ndarray, shape (order, n), optional
         Initial states X of the filters; zero by default.

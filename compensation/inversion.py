@@ -197,7 +197,6 @@ def invert(
     ----------
     kind : str
         A key of `KINDS`.
-    plant : DiscretePlant
     order : int
         n1: additional terms of ``ebzpetc`` (0 is ``zpetc``), terms of ``ts``.
     cancel_below : float

@@ -55,8 +55,6 @@ class InversionCompensator(Memoryless):
 
     Parameters
     ----------
-    machine : Machine
-    dt_s : float
     kind : str
         A key of `compensation.inversion.KINDS`.
     order : int or None

@@ -50,7 +50,6 @@ class LiftedWindow:
 
     Attributes
     ----------
-    plants : tuple of DiscretePlant
     weights : ndarray, shape (l,)
     update : int
         Samples that are committed before the next window starts.
@@ -112,7 +111,6 @@ def lifted_window(
 
     Parameters
     ----------
-    plants : sequence of DiscretePlant
     weights : sequence of float
         Weights of the members, positive, sum 1.
     window, update : int

@@ -25,7 +25,6 @@ class CommandBounds:
 
     Parameters
     ----------
-    machine : Machine
     dt_s : float
         Sampling time of the commands.
     """

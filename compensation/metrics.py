@@ -55,7 +55,6 @@ def effort_of_ce_opt(singular_values: ArrayLike, n: int) -> float:
     ----------
     singular_values : array_like, shape (samples,)
         Of the lifted plant, falling.
-    n : int
 
     Raises
     ------

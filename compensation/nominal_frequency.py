@@ -198,8 +198,6 @@ def extended_response(
     ----------
     f_hz, response : array_like, shape (k,)
         Rising frequencies and the measured response.
-    outside : DiscretePlant
-    points : int
 
     Raises
     ------

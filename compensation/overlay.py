@@ -23,10 +23,8 @@ class Overlay:
 
     Parameters
     ----------
-    inner : Compensator
     machine : Machine
         Source of the command limits.
-    dt_s : float
     """
 
     name: str

@@ -93,7 +93,6 @@ class AxisTask:
     stops : ndarray of int64, shape (k, 2)
         Ranges [a, b) of samples in which the command stands, including those before and after the
         piece.
-    bounds : Bounds
     rms_limit_mm_s2 : float
         Largest rms acceleration of a command that counts as smooth.
     """
@@ -126,8 +125,6 @@ class _Drive:
 
     Attributes
     ----------
-    task : AxisTask
-    rung : int
     path_mm, weight : ndarray, shape (windows * update + window,)
         Those of the task, relative to the start of the path, extended beyond its end.
     targets_mm : ndarray, shape (components, windows * update + window)
@@ -154,7 +151,6 @@ class Designs:
 
     Attributes
     ----------
-    lifted : LiftedWindow
     ladder : tuple of Rung
         `LADDER` with at most as many functions as the model's band allows; equal rungs are merged.
     at_rests : Condensed
@@ -335,7 +331,6 @@ class PreviewAxis:
         ----------
         rung : int
             Index into `Designs.ladder`.
-        task : AxisTask
         careful : set of int
             Windows in which the bounds are kept.
         targets_mm : ndarray, shape (members, n), optional

@@ -60,7 +60,6 @@ def input_command(wanted_mm: Array, table: RippleTable, share: Array | None = No
     Parameters
     ----------
     wanted_mm : ndarray, shape (n,)
-    table : RippleTable
     share : ndarray, shape (len(table), n), optional
         Share of every wave; see `wave_shares`.
 
@@ -170,7 +169,6 @@ class RippleCompensator(Overlay):
         Compensates vibration: its command is what the axes should receive.
     machine : Machine
         With its ripple.
-    dt_s : float
 
     Raises
     ------

@@ -42,7 +42,6 @@ class ScheduledCompensator:
         With schedules.
     make : callable
         Makes the compensator of a machine without schedules.
-    dt_s : float
 
     Attributes
     ----------

@@ -87,12 +87,8 @@ class ShaperCompensator(Memoryless):
 
     Parameters
     ----------
-    machine : Machine
-    dt_s : float
-    shaper : str
     fx_hz, fy_hz : float, optional
         Default: the resonance of the nominal plant that rings most.
-    zeta : float
     """
 
     def __init__(

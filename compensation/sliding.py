@@ -67,7 +67,6 @@ def slide(
     extruding : ndarray of bool, shape (n,)
     along : float
         Weight of the error along the path against that across it.
-    dt_s : float
 
     Returns
     -------

@@ -206,7 +206,6 @@ def within_bounds(
 
     Parameters
     ----------
-    functions : Functions
     tied : Tied
         Its solution without bounds. In the coordinates w = L' c, normal = L L', the cost is
         |w - wish|^2: well conditioned even where a rest leaves few samples.

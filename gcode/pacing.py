@@ -82,7 +82,6 @@ def move_classes(moves: Moves, first_layer: FirstLayer = FirstLayer()) -> Ints:
 
     Parameters
     ----------
-    moves : Moves
     first_layer : FirstLayer
         Its moves stay as they are.
 
@@ -107,12 +106,10 @@ def paced(piece: Piece, classes: Ints, paces: Mapping[int, Pace], machine: Machi
 
     Parameters
     ----------
-    piece : Piece
     classes : ndarray of int32, shape (moves of the piece,)
         As `move_classes` gives them.
     paces : mapping
         Class to pace; classes not listed keep theirs.
-    machine : Machine
 
     Returns
     -------

@@ -145,7 +145,6 @@ def distances(
         At least one, in order of time.
     points_mm : ndarray, shape (2 or more, n)
         x y first; of the times ``k dt``, but for what follows.
-    dt_s : float
     first : ndarray of int64, shape (stretches,)
         Point that each stretch begins with, rising from 0.
     late_s, until_s : ndarray, shape (stretches,)

@@ -58,7 +58,6 @@ class Loop:
         C_e, on the control error. 0: the output is not fed back, v = r.
     rate_num, rate_den : tuple of float
         C_y, on the measured output alone (velocity feedback).
-    name : str
     notes : tuple of str
         What was changed on reading.
     """

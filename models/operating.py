@@ -53,7 +53,6 @@ class OperatingGrid:
 
     Parameters
     ----------
-    machine : Machine
     step : float
         Largest ratio of a resonance from one mass or height to the next, minus 1.
     blend_step : float

@@ -58,7 +58,6 @@ def reference_motion(
 
     Parameters
     ----------
-    dt_s : float
     fastest_mm_s, largest_accel_mm_s2 : float
         Limits of speed and acceleration; from 250 mm/s and 5000 mm/s2 they change nothing.
     """

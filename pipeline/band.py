@@ -30,11 +30,6 @@ class BandContent:
     Blocks of 1024 samples (Welch 1967, Hann window, no overlap) of the planned acceleration, as
     slow travel would leak from a spectrum of positions; |Y(f)| = |A(f)| / (2 sin(pi f dt) / dt)^2,
     since the acceleration is a second difference.
-
-    Parameters
-    ----------
-    machine : Machine
-    dt_s : float
     """
 
     def __init__(self, machine: Machine, dt_s: float) -> None:

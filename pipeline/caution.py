@@ -215,7 +215,6 @@ def choose_caution(
 
     Parameters
     ----------
-    machine : Machine
     shaper : BestShaper
         Tuned for the nominal plants.
     directory : Path

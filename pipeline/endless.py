@@ -25,7 +25,6 @@ class LengthGuard:
     ----------
     text : binary file
         The print; its position is preserved.
-    machine : Machine
     dialect : Dialect
         Dialect of the file.
     """

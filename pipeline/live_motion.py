@@ -21,12 +21,7 @@ Array = NDArray[np.float64]
 
 
 class LiveMotion:
-    """The motion of a file through a look-ahead filter, rests included.
-
-    Parameters
-    ----------
-    live : LiveFilter
-    """
+    """The motion of a file through a look-ahead filter, rests included."""
 
     def __init__(self, live: LiveFilter) -> None:
         self._live = live

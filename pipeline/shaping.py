@@ -30,10 +30,6 @@ class ShapedMotion:
     """Motion that arrives in blocks, with the firmware's command for it.
 
     Shapers are centred, like Klipper's: a constant delay is not a path error.
-
-    Parameters
-    ----------
-    dt_s : float
     """
 
     def __init__(self, dt_s: float) -> None:

@@ -103,7 +103,6 @@ class Client:
         source : Path
         machine : str
             As the service calls it.
-        options : Options, optional
         name : str, optional
             What the file is called in the report; by default its own name.
         tell : callable, optional
@@ -168,7 +167,6 @@ class Client:
 
         Parameters
         ----------
-        job_id : str
         tell : callable, optional
             Is told of every change; may raise to stop the waiting.
         timeout_s : float, optional

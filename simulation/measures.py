@@ -123,7 +123,6 @@ class ContourErrors:
 
     Attributes
     ----------
-    first, stride : int
     error_mm : ndarray, shape (channels, m)
     """
 

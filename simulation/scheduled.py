@@ -34,8 +34,6 @@ class MachineStream:
 
     Parameters
     ----------
-    machine : Machine
-    dt_s : float
     point : OperatingPoint
         Where the machine is at first; without schedules it does not matter.
     member : int, optional

@@ -30,7 +30,6 @@ def write_controller(made: Designed, directory: Path) -> None:
 
     Parameters
     ----------
-    made : Designed
     directory : Path
         Made if it does not exist.
 

@@ -78,7 +78,6 @@ def design_report(
 
     Parameters
     ----------
-    machine : Machine
     axis : {"x", "y"}
     basis, robust : str
         As of `compensation.fbf.PreviewFbf`; ``auto`` is the mode of jobs, without a shaper's share.

@@ -45,7 +45,6 @@ def write_design(report: DesignReport, directory: Path) -> None:
 
     Parameters
     ----------
-    report : DesignReport
     directory : Path
         Made if it does not exist.
 

@@ -37,10 +37,8 @@ class Trial:
 
     Parameters
     ----------
-    machine : Machine
     axis : str
         The axis in doubt, x or y.
-    dt_s : float
     motion : (path, extruding), optional
         Shapes (2, n) in mm and (n,), at rest at both ends; default: the reference motion.
     errors_percent : sequence of float
@@ -97,7 +95,6 @@ class Trial:
 
         Parameters
         ----------
-        fbf : PreviewFbf
         mode : str
             Its setting of `robust`.
         rungs : sequence of str
@@ -123,7 +120,6 @@ class Trial:
         Parameters
         ----------
         command_mm : ndarray, shape (2, samples of `y_d_mm`)
-        plant : DiscretePlant
         """
         other = response([self._other], command_mm[[1 - self._row]])[0]
         return self._rms(command_mm, plant, other)

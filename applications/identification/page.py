@@ -34,7 +34,6 @@ def write_identification(report: IdentificationReport, directory: Path) -> None:
 
     Parameters
     ----------
-    report : IdentificationReport
     directory : Path
         Made if it does not exist.
 

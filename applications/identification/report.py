@@ -63,7 +63,6 @@ def identification_report(
         Axis to what was identified.
     settings : ReadSettings
         Settings with which the measurements were read.
-    sources : sequence of SourceFile
     """
     return IdentificationReport(
         version=__version__,

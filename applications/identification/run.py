@@ -87,10 +87,8 @@ def identify_files(
 
     Parameters
     ----------
-    files : sequence of InputFile
     base : Machine
         Source of everything that was not measured.
-    settings : ReadSettings, optional
     name, title : str, optional
         Of the machine, if it is a new one.
     max_order : int

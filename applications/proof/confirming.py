@@ -83,7 +83,6 @@ def verify_ring(
         The ring test as it was written.
     logs : sequence of Path
         Klipper's or RepRapFirmware's raw accelerations; each may hold one axis or both.
-    machine : Machine
     today : date, optional
         Of the confirmation.
 

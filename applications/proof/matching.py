@@ -102,7 +102,6 @@ def read_log(path: Path, otherwise: str) -> AccelerationLog:
 
     Parameters
     ----------
-    path : Path
     otherwise : str
         Advice in the message about a file of another kind.
 
@@ -148,7 +147,6 @@ def match(plan: Signal, log: Signal) -> Match:
     ----------
     plan : Signal
         Predicted acceleration of the nozzle, rows x y, from time 0 on.
-    log : Signal
     """
     segment_s = float(np.clip(log.duration_s / 8.0, *_SEGMENTS_S))
     coarse_plan, coarse_log = (_coarse(signal) for signal in (plan, log))

@@ -18,7 +18,6 @@ def write_readback(report: ReadbackReport, directory: Path) -> None:
 
     Parameters
     ----------
-    report : ReadbackReport
     directory : Path
         Made if it does not exist.
 

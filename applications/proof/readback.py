@@ -55,7 +55,6 @@ def verify_log(
         The G-code that was printed, compensated or not.
     log : Path
         Klipper's or RepRapFirmware's raw accelerations; any part of the print.
-    machine : Machine
     progress : callable, optional
         Called while the file is planned.
 

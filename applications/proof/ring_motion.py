@@ -61,7 +61,6 @@ class RingMotion:
     ----------
     command : Signal
         Positions of X and Y in mm.
-    stops : tuple of Stop
     quiet_s : dict
         By axis from when until when it stands still long before it moves (the other one creeps, as
         after the stops).

@@ -52,7 +52,6 @@ class ScanSettings:
     prefilter : "zpetc", "fbf" or "none"
     cutoff_hz : float, optional
         Of a zero-phase low-pass after zpetc.
-    timing : Timing
     disturbance : optional
         In the machine's unit. Left out, the controller's own, scaled to `disturbance_um`.
     enters : "output" or "input", optional
@@ -75,7 +74,6 @@ class Scan:
 
     Attributes
     ----------
-    report : ScanReport
     t_s : ndarray, shape (n,)
     command : ndarray, shape (2, n)
         References of both axes in the machine's unit.

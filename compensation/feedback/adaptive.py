@@ -45,7 +45,6 @@ class FrequencyTracker:
     tones : int
         At most 8. One locks within about 100 samples, three within about 500, even at a
         signal-to-noise ratio of 8 dB.
-    dt_s : float
     floor_rms : float
         Signals below this rms are ignored.
 
@@ -112,7 +111,6 @@ class AdaptiveFmsdob:
     ----------
     loops : sequence of Loop
         The nominal loop, then the members of its plant set.
-    tones : int
     bandwidth_hz : float
         Of the band pass.
     floor_rms : float

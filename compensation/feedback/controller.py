@@ -139,20 +139,16 @@ class Controller:
 
     Attributes
     ----------
-    method, machine : str
     dt_s : float
         Sampling time of the blocks.
-    coefficients : tuple of CoefficientSet
     blocks : tuple of Block
         The controller as difference equations, which `simulation.closed_loop` can run.
-    prediction : Prediction
     noise_gain : float
         rms of y per rms of white sensor noise, unless `notes` says otherwise.
     spectral_radii : tuple of float
         Of the whole loop, for the nominal plant and every member; all below 1.
     settings : mapping
         The requested design (targets, widths, ...), for the record.
-    notes : tuple of str
     """
 
     method: str
@@ -255,7 +251,6 @@ def judged(
 
     Parameters
     ----------
-    design : Design
     loops : sequence of Loop
         The nominal loop, then the members of its plant set.
     uncertainty : float or function of f_hz, optional

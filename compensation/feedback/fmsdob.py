@@ -61,8 +61,6 @@ class QFilter:
 
     Attributes
     ----------
-    taps : tuple of float
-    band_pass : LatticeBandPass or None
     gain : float
         Detuning: below 1 the depth of the notches is 1 - gain.
     """
@@ -153,7 +151,6 @@ def fmsdob(
         against the sampling rate make Hermite filters amplify elsewhere: see `max_add_on`.
     bandwidth_hz : float, sequence of float, or None
         -3 dB width of the band pass; None: no band pass.
-    trim : Trim
     around : "servo" or "plant"
         Forward model, see the module.
     uncertainty : float or function of f_hz, optional

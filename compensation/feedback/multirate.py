@@ -74,7 +74,6 @@ def design_multirate(
         At the sampling rate: the nominal loop, then the members of its plant set.
     fast : Loop
         The same machine, identified at the fast rate; its servo is inverted.
-    fundamental_hz : float
     alpha, nyquist_pairs, notches_hz, uncertainty
         See `compensation.feedback.repetitive.design_wide_band`.
 

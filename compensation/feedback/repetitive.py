@@ -160,7 +160,6 @@ class ServoInverse:
         Powers of z^-1.
     preview : int
         Samples of look-ahead, to be compensated by a delay elsewhere.
-    notes : tuple of str
     blocks_constants : bool
         V(1) = 0: its input must be free of constants.
     """
@@ -192,9 +191,6 @@ def design_wide_band(
     ----------
     loops : sequence of Loop
         The nominal loop, then the members of its plant set.
-    fundamental_hz : float
-    alpha : float
-    nyquist_pairs : int
     notches_hz : sequence of float
         Frequencies at which the add-on has no effect.
     uncertainty

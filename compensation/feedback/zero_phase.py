@@ -37,9 +37,7 @@ class Prefilter:
 
     Attributes
     ----------
-    inversion : Inversion
     fir : ndarray, shape (2 l + 1,), or None
-    dt_s : float
     """
 
     inversion: Inversion
@@ -100,7 +98,6 @@ def design_prefilter(
 
     Parameters
     ----------
-    loop : Loop
     cutoff_hz : float, optional
         Of the zero-phase FIR; None: no FIR (see `fir_within`).
     length : int

@@ -101,7 +101,6 @@ class Rules(NamedTuple):
         shorter of two segments; what does not fit is made to cost as much. Then a gentle
         acceleration, beyond which it is to cost something, too, where a motor makes more steps per
         sample than the third number.
-    corexy : bool
     """
 
     least: int
@@ -294,8 +293,6 @@ def choose_vertices(
         a step of X.
     heading : ndarray, shape (m, 2)
         The path's direction there, a unit vector.
-    rules : Rules
-    answer : Answer
     chosen : ndarray of int64, shape (n,)
         Filled: the number of the vertex' place, -1 where it is left out.
 

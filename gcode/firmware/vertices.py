@@ -43,7 +43,6 @@ class Lattice:
         First and last step of X and Y.
     least : int
         Fewest steps of a move.
-    corexy : bool
     speed_step_mm_s : float
         Largest step of a motor's speed.
     spare_steps : float
@@ -104,8 +103,6 @@ def vertices_on_steps(lattice: Lattice, timeline: Timeline, segments: Segments) 
 
     Parameters
     ----------
-    lattice : Lattice
-    timeline : Timeline
     segments : Segments
         At least one, fitted much finer than the steps. Where they have no `error_filter`, all
         errors count alike.

@@ -33,7 +33,6 @@ class TimeField:
 
     Attributes
     ----------
-    kind : TimeKind
     start, end : int
         Bytes of the line that hold the number or duration.
     text : bytes

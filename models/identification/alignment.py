@@ -40,7 +40,6 @@ class AlignedLog:
 
     Attributes
     ----------
-    rate_hz : float
     command_mm_s2, measured_mm_s2 : ndarray, shape (n,)
         The command as averages over the sampling interval (`VelocityProfile.cell_averages`), the
         measurement along `direction`; from just before the test to its end.

@@ -92,7 +92,6 @@ def frame_of(measured: FrequencyResponse, near: Frame | None = None) -> Frame | 
 
     Parameters
     ----------
-    measured : FrequencyResponse
     near : Frame, optional
         What the response showed before friction was removed from it: look for this one again.
     """

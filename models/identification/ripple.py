@@ -87,8 +87,6 @@ class RippleLearning:
 
     Attributes
     ----------
-    ripple : AxisRipple
-    observability : tuple of Observability
     explained : float
         Share of the log's deviation (rms) that the waves explain, 0..1.
     """
@@ -111,7 +109,6 @@ def learn_ripple(
     ----------
     passes : sequence of PassLog
         All positions or all accelerations.
-    basis : sequence of WaveBasis
     plant : DiscretePlant
         The axis, at the sampling time of the commands.
     homing_repeatability_mm : float

@@ -52,7 +52,6 @@ class Sensor:
         From the machine's axes to the sensor's.
     delay_s : float
         Readings are this late.
-    gain : float
     jitter_s : float
         Standard deviation of the error of each time stamp.
     """
@@ -118,7 +117,6 @@ def simulate_log(
         The test's true start, on the clock of the log.
     lead_s, tail_s : float
         Rest that is recorded before and after. Negative: the log begins late or ends early.
-    rng : numpy.random.Generator
 
     Returns
     -------

@@ -219,7 +219,6 @@ class AxisIdentification:
         Of the nominal plant; None for a model that was read.
     measured : tuple
         FrequencyResponse or Spectrum, one per measurement.
-    member_fits : tuple of Fit
     schedule : AxisSchedule, optional
         If the axis was measured with a weight on the bed, or at several places.
     warnings, notes : tuple of str

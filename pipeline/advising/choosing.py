@@ -171,10 +171,6 @@ def choose(
 
     Parameters
     ----------
-    samples : FileSamples
-    sliced : AsSliced
-    machine : Machine
-    adviser : Adviser
     budget_um : float, optional
         Error allowed to every feature; None: its error as sliced.
     progress : callable, optional

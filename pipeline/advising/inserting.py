@@ -45,8 +45,6 @@ class AdviceWriter:
 
     Parameters
     ----------
-    adviser : Adviser
-    advice : Advice
     names : list of str
         Feature names of the reader; the list grows as the file is read.
     initial : Limits
@@ -242,7 +240,6 @@ def write_advised(
     source, out : binary files
     reader : Interpreter
         Unused so far; the writer shares its list of feature names.
-    writer : AdviceWriter
     """
     out.seek(0)
     out.truncate()

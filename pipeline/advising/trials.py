@@ -54,12 +54,8 @@ class Trial:
 
     Parameters
     ----------
-    samples : FileSamples
     bounds : mapping
         Feature id to the bounds of its acceleration.
-    machine : Machine
-    adviser : Adviser
-    dt_s : float
     members : sequence
         Of `pipeline.measuring.set_errors.machine_numbers`.
     point : OperatingPoint, optional

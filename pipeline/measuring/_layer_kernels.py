@@ -125,13 +125,10 @@ def follow(
         `row` is an index into the moves.
     begin : int
         First sample to process.
-    moves : Columns
     first, until : int
         Number in the file of the first of the moves; moves before `until` end after the samples.
     point_bytes : float
         Size of a point.
-    state : State
-    points : Points
 
     Returns
     -------

@@ -30,7 +30,6 @@ class EarlierErrors:
     ----------
     folder : Path
         Folder of the temporary file.
-    channels : int
     """
 
     def __init__(self, folder: Path, channels: int) -> None:

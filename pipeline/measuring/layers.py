@@ -83,7 +83,6 @@ class LayerRecorder:
 
     Parameters
     ----------
-    channels : int
     sample_s : float
         Time from sample to sample.
     takers : sequence of callables
@@ -145,7 +144,6 @@ class LayerRecorder:
             Planned positions.
         z_mm, extruding, row : ndarray, shape (n,)
             `row` is an index into `moves`.
-        moves : Moves
         first_move : int
             Number of the first of them in the file.
         error_mm : ndarray, shape (channels, n)

@@ -33,8 +33,6 @@ class Maxima:
 
     Parameters
     ----------
-    dt_s : float
-    channels : int
     exact : int, optional
         The channel whose largest errors on lines are found; None: no channel.
 

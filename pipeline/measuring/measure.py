@@ -58,8 +58,6 @@ class Measurement:
 
     Parameters
     ----------
-    machine : Machine
-    dt_s : float
     shaper : BestShaper
         The reference shaper.
     names : tuple of str

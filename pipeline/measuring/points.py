@@ -26,7 +26,6 @@ class MotionSamples:
     extruding : ndarray of bool, shape (n,)
     row : ndarray of int64, shape (n,)
         Row of `moves` that each sample belongs to.
-    moves : Moves
     first_move : int
         Number of the first of them in the file.
     sliced_mm : ndarray, shape (2, n), optional

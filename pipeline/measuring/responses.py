@@ -48,8 +48,6 @@ class Responses:
 
     Parameters
     ----------
-    machine : Machine
-    dt_s : float
     shaper : BestShaper
         Its delay is removed.
     names : sequence of str

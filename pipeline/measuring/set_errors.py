@@ -40,7 +40,6 @@ class ErrorSum:
     ----------
     squares_um2_s : ndarray, shape (plants,)
         Integral of the squared error of every plant.
-    seconds : float
     """
 
     squares_um2_s: Array
@@ -75,8 +74,6 @@ class SetErrors:
 
     Parameters
     ----------
-    machine : Machine
-    dt_s : float
     stride : int
         Every `stride`-th sample is measured.
     """

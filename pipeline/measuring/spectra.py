@@ -31,8 +31,6 @@ class ErrorSpectra:
 
     Parameters
     ----------
-    machine : Machine
-    dt_s : float
     names : sequence of str
         Channels.
     """

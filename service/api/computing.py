@@ -142,7 +142,6 @@ async def run_and_wait(request: Request, caller: Caller, asked: ComputeRequest) 
         Its body must have been read.
     caller : Caller
         Whose turn it is.
-    asked : ComputeRequest
 
     Raises
     ------

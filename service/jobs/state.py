@@ -81,7 +81,6 @@ class Job:
 
     Attributes
     ----------
-    id : str
     kind : JobKind
         Compensations have an uploaded file and a report; other kinds only a result.
     owner : str

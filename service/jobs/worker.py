@@ -97,7 +97,6 @@ def run_job(job_id: str, settings: dict[str, Any] | None, runner: str) -> None:
 
     Parameters
     ----------
-    job_id : str
     settings : dict, optional
         Fields of `Settings`; by default this process reads them from its environment.
     runner : str

@@ -35,7 +35,6 @@ class Accelerometer:
 
     Attributes
     ----------
-    rate_hz, step_mm_s2, noise_mm_s2 : float
     gains : tuple of float
         Of its three axes.
     turn_rad : tuple of float

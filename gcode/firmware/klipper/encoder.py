@@ -83,7 +83,6 @@ class KlipperEncoder:
 
     Parameters
     ----------
-    firmware : Klipper
     limits : KlipperLimits
         Limits of the stream.
     """

@@ -227,7 +227,6 @@ def assign_rates(
 
     Parameters
     ----------
-    blocks : Blocks
     foreign_s : ndarray, shape (n,)
         How long moves that are not ours take.
     correction_s : ndarray, shape (n,)
@@ -238,7 +237,6 @@ def assign_rates(
         Of the step timer.
     least_hz : float
         Lowest step rate; the difference to slower motion or standstill is carried over too.
-    start_s : float
     feedrate, predicted_s : ndarray, shape (n,)
         Filled.
     """

@@ -32,7 +32,6 @@ def zeros_poles_gain(
     Parameters
     ----------
     a, b, c : ndarray, shapes (n, n), (n,), (n,)
-    d : float
     dt_s : float or None
         None: continuous.
 
