@@ -319,8 +319,12 @@ def _tied_problem(
 
     Parameters
     ----------
-    z, targets, weight
-        As in `compensation.window_problem.solve_window`.
+    z : ndarray, shape (nz,)
+        Member states and the last two commands.
+    targets : ndarray, shape (components, window)
+        Target of each component of the set: `lifted.target` times the path, or close to it.
+    weight : ndarray, shape (window,)
+        Weight of the errors.
     moving : ndarray of int64, shape (k, 2)
         Segments [s, e) between rests; some may be empty.
 

@@ -27,7 +27,6 @@ from stillpath.compensation._window_kernels import (
     command_of,
     constraints_at,
     extremes,
-    tied_window,
 )
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.lifted_window import Condensed
@@ -40,7 +39,6 @@ __all__ = [
     "Extremes",
     "functions_of",
     "refusing_singular",
-    "solve_window",
     "within_bounds",
 ]
 
@@ -123,44 +121,6 @@ class Extremes(NamedTuple):
         return cls(*extremes(command, last, previous, stops))
 
 
-def solve_window(
-    design: PreviewDesign,
-    z: Array,
-    path_mm: Array,
-    targets_mm: Array,
-    weight: Array,
-    rests: NDArray[np.int64],
-    bounds: Bounds,
-) -> Array:
-    """Return the command of one window that stands still in the given rests.
-
-    Parameters
-    ----------
-    design : PreviewDesign
-        Gains and lifted plants of the axis.
-    z : ndarray, shape (nz,)
-        Member states and the last two commands.
-    path_mm : ndarray, shape (window,)
-        Planned positions, on which the command stands in the rests.
-    targets_mm : ndarray, shape (components, window)
-        Target of each component of the set: `lifted.target` times the path, or close to it.
-    weight : ndarray, shape (window,)
-        Weight of the errors.
-    rests : ndarray of int64, shape (k, 2)
-        Ranges [a, b) of samples, relative to the window, in which u(i) = u(i - 1) = path(i - 1).
-    bounds : Bounds
-        Kept if possible; the caller checks.
-
-    Returns
-    -------
-    ndarray, shape (window,)
-    """
-    functions = functions_of(design, at_rests=len(rests) > 0)
-    with refusing_singular():
-        tied = tied_window(functions, z, path_mm, targets_mm, weight, rests, bounds.limits())
-    return tied.command if tied.kept else within_bounds(functions, tied, z, path_mm, bounds)
-
-
 @contextlib.contextmanager
 def refusing_singular() -> Iterator[None]:
     """Turn a singular window problem into a DesignError."""
@@ -209,8 +169,12 @@ def within_bounds(
     tied : Tied
         Its solution without bounds. In the coordinates w = L' c, normal = L L', the cost is
         |w - wish|^2: well conditioned even where a rest leaves few samples.
-    z, path_mm, bounds
-        As in `solve_window`.
+    z : ndarray, shape (nz,)
+        Member states and the last two commands.
+    path_mm : ndarray, shape (window,)
+        Planned positions, on which the command stands in the rests.
+    bounds : Bounds
+        Kept if possible; the caller checks.
     """
     command, rows, low, high = tied.command, tied.pinned, tied.values, tied.values
     last, previous = float(z[-2]), float(z[-1])
