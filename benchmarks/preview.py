@@ -44,6 +44,7 @@ from stillpath.compensation.basis import BASES
 from stillpath.compensation.fbf import PreviewFbf
 from stillpath.compensation.lifted_window import lifted_window
 from stillpath.compensation.preview import PreviewDesign
+from stillpath.models.arrays import Array
 from stillpath.models.plants import DiscretePlant, Mode, ModesSpec, discretise, plant_set
 from stillpath.models.reference_motion import reference_motion
 from stillpath.models.store import builtin_machines, load_machine
@@ -66,8 +67,6 @@ __all__ = [
     "one_mode",
     "taz",
 ]
-
-Array = NDArray[np.float64]
 
 DT_S = 1e-3
 SHARPNESS = 32

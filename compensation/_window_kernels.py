@@ -15,6 +15,7 @@ from stillpath.compensation._least_squares_kernels import (
     weighted_gram,
 )
 from stillpath.compensation._preview_kernels import advance_window, run_windows
+from stillpath.models.arrays import Array, Ints
 from stillpath.models.jit import kernel
 
 __all__ = [
@@ -29,8 +30,6 @@ __all__ = [
     "tied_window",
 ]
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
 

@@ -12,11 +12,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.lifted import LiftedSet
 from stillpath.compensation.operators import LiftedOperator
+from stillpath.models.arrays import Array
 
 __all__ = [
     "BASES",
@@ -35,7 +35,6 @@ __all__ = [
     "spread_functions",
 ]
 
-Array = NDArray[np.float64]
 Basis = Callable[[LiftedSet, int], Array]
 
 TOLERANCE = 1e-7

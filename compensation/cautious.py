@@ -17,12 +17,11 @@ from stillpath.compensation.base import DesignError
 from stillpath.compensation.fbf import PreviewFbf
 from stillpath.compensation.preview_axis import GENTLE_RUNG
 from stillpath.compensation.shapers import ShaperCompensator
+from stillpath.models.arrays import Array
 from stillpath.models.machine import Machine
 from stillpath.models.schedule import OperatingPoint
 
 __all__ = ["Caution", "CautiousFbf"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -37,11 +37,11 @@ from scipy.linalg import toeplitz
 from scipy.signal import lfilter, sosfilt, zpk2sos
 
 from stillpath.compensation.base import DesignError
+from stillpath.models.arrays import Array
 from stillpath.models.plants import DiscretePlant
 
 __all__ = ["KINDS", "NEAR_CIRCLE", "Inversion", "TwoSidedFilter", "invert"]
 
-Array = NDArray[np.float64]
 Roots = NDArray[np.complex128]
 
 NEAR_CIRCLE = 5e-4

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillpath.compensation._preview_kernels import advance_state, advance_window, impulse_states
 from stillpath.compensation._window_kernels import Functions, Memory, Stepping, solve_windows
@@ -22,6 +21,7 @@ from stillpath.compensation.window_problem import (
     refusing_singular,
     within_bounds,
 )
+from stillpath.models.arrays import Array, Ints
 from stillpath.models.plants import DiscretePlant
 from stillpath.models.response_kernels import dense_response
 
@@ -39,9 +39,6 @@ __all__ = [
     "designs",
     "functions_within",
 ]
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,6 @@ from typing import NamedTuple
 
 import daqp
 import numpy as np
-from numpy.typing import NDArray
 
 from stillpath.compensation._window_kernels import (
     Functions,
@@ -31,6 +30,7 @@ from stillpath.compensation._window_kernels import (
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.lifted_window import Condensed
 from stillpath.compensation.preview import PreviewDesign, running_gram
+from stillpath.models.arrays import Array
 
 __all__ = [
     "EFFORT_PRICE",
@@ -41,8 +41,6 @@ __all__ = [
     "refusing_singular",
     "within_bounds",
 ]
-
-Array = NDArray[np.float64]
 
 EFFORT_PRICE = 0.5
 """Weight of squared increments (mm/sample^2)^2 relative to squared error mm^2 at rests."""

@@ -20,6 +20,7 @@ from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.pieces import Piece
 from stillpath.gcode.plan import plan_moves
 from stillpath.gcode.types import Moves
+from stillpath.models.arrays import Mask
 from stillpath.models.machine import CommandLimits, Machine
 
 __all__ = [
@@ -34,7 +35,6 @@ __all__ = [
 ]
 
 Ints = NDArray[np.int32]
-Mask = NDArray[np.bool_]
 
 TRAVEL, AS_SLICED = -2, -3
 """Classes beside the features, whose ids begin at -1 (unnamed)."""

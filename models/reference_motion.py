@@ -11,11 +11,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array
 from stillpath.models.machine import Machine
 
 __all__ = ["reference_limits", "reference_motion", "reference_motion_of"]
-
-Array = NDArray[np.float64]
 
 _CORNER_MM_S = 5.0
 _TRAVEL_MM_S, _TRAVEL_MM_S2 = 200.0, 5000.0

@@ -7,11 +7,11 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array
 from stillpath.models.machine import Machine
 
 __all__ = ["BandContent"]
 
-Array = NDArray[np.float64]
 T = TypeVar("T", bound=np.generic)
 
 BLOCK = 1024

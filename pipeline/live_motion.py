@@ -7,17 +7,15 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.live_filter import LiveFilter
+from stillpath.models.arrays import Array
 from stillpath.models.schedule import OperatingPoint
 from stillpath.models.shaping import OFF, Shaping
 from stillpath.pipeline.measuring.points import MotionSamples, part_of
 
 __all__ = ["LiveMotion"]
-
-Array = NDArray[np.float64]
 
 
 class LiveMotion:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from stillpath.applications.design.figures import Curve
 from stillpath.compensation.fbf import PreviewFbf
 from stillpath.compensation.shapers import shape_xy
+from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
 from stillpath.models.plants import DiscretePlant, PlantSpec, WeightedMember, discretise, plant_set
@@ -23,8 +24,6 @@ from stillpath.simulation.measures import Tally, contour_error
 from stillpath.simulation.response import response
 
 __all__ = ["STAND_S", "Trial"]
-
-Array = NDArray[np.float64]
 
 STAND_S = 0.12
 """Standstill before and after the motion: centred shapers begin early and end late."""

@@ -17,13 +17,12 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import butter, correlate, sosfiltfilt
 from scipy.stats import theilslopes
 
+from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.readers import read_measurements
 from stillpath.models.identification.types import AccelerationLog
 
 __all__ = ["Match", "Signal", "band_pass", "log_signal", "match", "read_log"]
-
-Array = NDArray[np.float64]
 
 _COARSE_HZ = 125.0
 _COARSE_BAND_HZ = (2.0, 22.0)

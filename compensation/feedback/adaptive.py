@@ -14,19 +14,18 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial import chebyshev
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.feedback._adaptive_kernels import track
 from stillpath.compensation.feedback.controller import Controller
 from stillpath.compensation.feedback.fmsdob import QFilter, add_on_blocks, design_q, fmsdob
+from stillpath.models.arrays import Array
 from stillpath.models.diagrams import Block
 from stillpath.models.loops import Loop
 
 __all__ = ["AdaptiveFmsdob", "FrequencyTracker", "Retuning"]
 
-Array = NDArray[np.float64]
 _START_RADIUS, _END_RADIUS = 0.3, 0.98
 _START_FORGETTING, _END_FORGETTING = 0.9, 0.995
 _DECAY_SAMPLES = 25

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillpath.compensation.base import DesignError
+from stillpath.models.arrays import Array, Complex
 from stillpath.models.diagrams import Block, Diagram
 from stillpath.models.disturbances import SensorSpec
 from stillpath.models.loops import Loop
@@ -31,8 +31,6 @@ __all__ = [
     "judged",
 ]
 
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 Values = float | int | tuple[float, ...] | tuple[tuple[float, ...], ...]
 Uncertainty = float | Callable[[Array], Array]
 """Bound of the relative plant error |Delta(f)|: one number, or a function of the frequencies."""

@@ -12,19 +12,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.feedback.controller import CoefficientSet, Extreme
 from stillpath.compensation.inversion import Inversion, invert
 from stillpath.compensation.inverting import zero_phase_fir
+from stillpath.models.arrays import Array, Complex
 from stillpath.models.loops import Loop
 from stillpath.models.plants import DiscretePlant, balanced_discrete
 
 __all__ = ["Prefilter", "design_prefilter", "reference_plant"]
-
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 _PREVIEW = 5
 

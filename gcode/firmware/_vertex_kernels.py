@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array, Ints
 from stillpath.models.jit import kernel
 
 __all__ = [
@@ -30,9 +31,6 @@ __all__ = [
     "list_places",
     "nearly_back",
 ]
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 MOST_PLACES = 13
 """Candidate places of a vertex in slow motion; elsewhere `_PLACES`."""

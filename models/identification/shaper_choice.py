@@ -11,8 +11,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.types import Spectrum
 from stillpath.models.shaper_pulses import Pulses, shaper_pulses
@@ -24,8 +25,6 @@ __all__ = [
     "klipper_weighting",
     "residual_vibration",
 ]
-
-Array = NDArray[np.float64]
 
 _LOWEST_HZ = {"zv": 21.0, "mzv": 23.0, "ei": 29.0, "2hump_ei": 39.0, "3hump_ei": 48.0}
 _HIGHEST_HZ = 200.0

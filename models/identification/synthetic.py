@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.excitation import VelocityProfile, klipper_psd, regenerate
 from stillpath.models.identification.types import AccelerationLog, Excitation, Spectrum
@@ -29,8 +30,6 @@ __all__ = [
     "write_raw_data",
     "write_table",
 ]
-
-Array = NDArray[np.float64]
 
 _GRAVITY_MM_S2 = np.array([0.0, 0.0, 9806.65])
 _STOP_MM_S2 = 3000.0

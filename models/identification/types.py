@@ -8,6 +8,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array
 from stillpath.models.plants import PlantSetSpec, PlantSpec
 from stillpath.models.schedule import AxisSchedule
 
@@ -24,8 +25,6 @@ __all__ = [
     "PlantModel",
     "Spectrum",
 ]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,11 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillpath.gcode.types import Moves
+from stillpath.models.arrays import Array
 from stillpath.pipeline.measuring import _layer_kernels as kernels
 
 __all__ = ["ERROR_UM", "TILE_POINTS", "UNKNOWN", "LayerRecorder", "LayerTile", "point_bytes"]
-
-Array = NDArray[np.float64]
 
 TILE_POINTS = 1 << 17
 """A layer with more points is split into several tiles."""

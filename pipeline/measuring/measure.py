@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillpath.gcode.slicers.features import feature_name, feature_title
+from stillpath.models.arrays import Array
 from stillpath.models.machine import Machine
 from stillpath.models.schedule import OperatingPoint
 from stillpath.pipeline.band import BandContent
@@ -38,8 +39,6 @@ from stillpath.pipeline.result import (
 from stillpath.simulation.measures import ContourErrors, GroupTally, MotionMeter, Tally
 
 __all__ = ["CHANNELS", "STRIDE", "UNCHANGED_CHANNELS", "Measurement"]
-
-Array = NDArray[np.float64]
 
 CHANNELS = ("before", "after", "shaper")
 """The measured channels, in the order of all tables."""

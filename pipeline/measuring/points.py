@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillpath.gcode.types import Moves
+from stillpath.models.arrays import Array
 
 __all__ = ["MeasuredPoints", "MotionSamples", "part_of"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
