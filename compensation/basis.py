@@ -70,8 +70,6 @@ def bspline_basis(samples: int, n: int, degree: int = 3) -> Array:
 
     Parameters
     ----------
-    samples : int
-        Length of the window.
     n : int
         Number of functions, at least ``degree + 1``.
     degree : int

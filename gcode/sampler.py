@@ -158,13 +158,7 @@ def distances(
 
 
 class Sampler:
-    """Sample a stream of phases on the grid ``t = k dt``, k = 0, 1, ...
-
-    Parameters
-    ----------
-    dt_s : float
-        Step.
-    """
+    """Sample a stream of phases on the grid ``t = k dt``, k = 0, 1, ..."""
 
     def __init__(self, dt_s: float) -> None:
         if not (dt_s > 0 and math.isfinite(dt_s)):

@@ -116,8 +116,6 @@ def build_timeline(
         As `group_rows` gives them.
     rest_s : ndarray, shape (len(groups),)
         Duration of each rest under the limits of the written file (ignored for stretches).
-    dt_s : float
-        Sampling time.
     lead_s, tail_s : float
         Standing time before and after every stretch, for compensators that need it.
     """

@@ -52,8 +52,6 @@ class Loop:
     ----------
     plant_num, plant_den : tuple of float
         P, strictly proper.
-    dt_s : float
-        Sampling time.
     error_num, error_den : tuple of float
         C_e, on the control error. 0: the output is not fed back, v = r.
     rate_num, rate_den : tuple of float

@@ -57,8 +57,6 @@ class LiveDesign:
     taps : ndarray, shape (2, n)
     shares : (float, float)
         Share of the filter in the taps of X and Y; the rest is the shaper.
-    corner_hz : float
-        Bandwidth of the filter.
     worst, mean : float
         Largest and geometric mean over the members of the contour error against the shaper's.
     ranges : dict of str to ErrorRange

@@ -52,8 +52,6 @@ class Verifier:
 
         Parameters
         ----------
-        piece : Piece
-            The piece as sliced.
         gap_mm : ndarray
             Distance from the command (`pipeline.piece_compensator.deviation`).
 
@@ -100,8 +98,6 @@ class Verifier:
         ----------
         motion : MotionSamples
             Without `sliced_mm` (the firmware does not round to steps) nothing is done.
-        point : OperatingPoint
-            Operating point.
 
         Raises
         ------

@@ -61,8 +61,6 @@ class Client:
     ----------
     server : str
         As in a browser: ``http://127.0.0.1:8000``.
-    key : str, optional
-        An API key.
     patience_s : float
         For how long a service that does not answer, or is busy, is asked again.
 

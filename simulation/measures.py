@@ -144,8 +144,6 @@ class ContourMeter:
 
     Parameters
     ----------
-    dt_s : float
-        Sampling time.
     window_s : float
         Time before and after a point in which the path counts; less at start and end.
     stride : int

@@ -33,8 +33,6 @@ class LoadedController:
     ----------
     spec : LoopSpec
         The machine it was designed for.
-    options : ControllerOptions
-        Options of the design.
     every : int
         Block samples per sample of the machine's loop.
     settling : int

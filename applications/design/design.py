@@ -129,8 +129,6 @@ class _Designed:
 
     Attributes
     ----------
-    row : int
-        Row of the axis.
     by_mode : dict of str to PreviewFbf
         For every robust mode that can be designed.
     missing : list of str

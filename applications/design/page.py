@@ -41,18 +41,7 @@ _STYLES = {
 
 
 def write_design(report: DesignReport, directory: Path) -> None:
-    """Write design.html and design.json into a folder, each whole or not at all.
-
-    Parameters
-    ----------
-    directory : Path
-        Made if it does not exist.
-
-    Raises
-    ------
-    OSError
-        If the folder or a file cannot be written.
-    """
+    """Write design.html and design.json into a folder by `reports.pages.write_texts`."""
     page = render_design(report)
     write_texts(directory, {"design.json": report.model_dump_json(), "design.html": page})
 

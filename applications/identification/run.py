@@ -40,8 +40,6 @@ class InputFile:
     ----------
     name : str
         Without folder; tells axis and date.
-    condition : Condition
-        Conditions of the measurement.
     """
 
     name: str

@@ -58,8 +58,6 @@ def judge(axis: AxisMotion, dt_s: float) -> AxisReadback:
     ----------
     axis : AxisMotion
         Predicted and measured acceleration, aligned but for a millisecond or so.
-    dt_s : float
-        Sampling time.
     """
     n = len(axis.measured)
     window = tukey(n, 0.02)

@@ -70,8 +70,6 @@ class Match:
         The part of the plan that the log follows without a jump.
     offset_s, rate : float
         Log time = offset_s + rate * plan time.
-    log_s : float
-        Length of the log.
     places : int
         Places in the plan that fit about as well (repeated layers); the best one was taken.
     """

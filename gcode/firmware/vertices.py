@@ -47,8 +47,6 @@ class Lattice:
         Largest step of a motor's speed.
     spare_steps : float
         Steps within a segment that rounding may add to that.
-    accel_mm_s2 : float
-        Acceleration of the moves.
     moves_per_s : float
         Rate at which moves arrive.
     fast_mm_s, fast_accel_mm_s2 : float

@@ -35,8 +35,6 @@ class TimeField:
     ----------
     start, end : int
         Bytes of the line that hold the number or duration.
-    text : bytes
-        Those bytes.
     seconds : float
         What they say; of `PERCENT` the per cent.
     unit_s : float

@@ -83,8 +83,6 @@ def choose_shaper(
     f_hz : array_like, shape (n,)
     psd : array_like, shape (n,) or (data sets, n)
         Spectra of the acceleration, summed over the sensor's axes, not normalised.
-    corner_mm_s : float
-        Square corner velocity.
 
     Raises
     ------

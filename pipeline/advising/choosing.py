@@ -141,8 +141,6 @@ class AsSliced:
 
     Attributes
     ----------
-    names : sequence of str
-        Names of the features.
     shaping : Shaping
         The printer's shaper.
     errors_um : mapping

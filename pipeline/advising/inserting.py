@@ -54,8 +54,6 @@ class AdviceWriter:
 
     Attributes
     ----------
-    lines : int
-        Number of inserted lines.
     shaper_left : bool
         At the end the printer's previous shaper was unknown: ours stays, at least in part.
     """

@@ -83,8 +83,6 @@ class ComputeRequest:
 
     Attributes
     ----------
-    machine : str
-        Its name.
     document : Machine, optional
         The machine, where the job needs it.
     revision : str

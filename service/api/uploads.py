@@ -74,8 +74,6 @@ async def receive_upload(request: Request, target: Path, *, max_bytes: int, disk
     target : Path
         Is left incomplete when an error is raised; the caller deletes it. Nothing is synced:
         what stores the file for good does that.
-    max_bytes : int
-        Largest body.
     disk : Disk
         That `target` is on.
 

@@ -95,8 +95,6 @@ class Job:
         Digest of input, machine, options and version: equal jobs have the same result.
     priority : int
         Higher ones go first.
-    source_name, result_name : str
-        File names.
     source_bytes, source_sha256 : int, str
         Of the upload.
     output : str or None

@@ -93,8 +93,6 @@ class Watch:
 
     Parameters
     ----------
-    job : Job
-        The claimed job.
     interrupted : callable
         Returns why this worker has to give its job back, or None.
     has_room : callable

@@ -75,8 +75,6 @@ class Workplace:
     ----------
     scratch : Path
         Folder for temporary files.
-    name : str
-        Name of the worker.
     interrupted : callable
         Returns why the worker has to give its job back, or None.
     end : callable

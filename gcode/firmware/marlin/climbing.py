@@ -43,8 +43,6 @@ def climb_in_long_moves(
         Those that are to be written, with X and Y on whole steps.
     per_mm : float
         Steps of Z.
-    limits : MarlinLimits
-        Limits of the segments.
 
     Returns
     -------

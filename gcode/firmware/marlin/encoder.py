@@ -131,8 +131,6 @@ class MarlinEncoder:
 
     Parameters
     ----------
-    command : CommandLimits
-        Limits of the motors.
     travel_mm : sequence of (float, float), optional
         Least and largest X, and Y.
     """
