@@ -23,10 +23,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from readback import DT_S, WINDOW_S, Aligned, Motion, Own, Timed, forced_stops, read_motion
 from scipy.linalg import expm
 
+from stillpath.models.arrays import Array
 from stillpath.models.machine import Machine
 from stillpath.models.plants import Mode, ModesSpec, RelativeModesSpec
 from stillpath.models.response_kernels import dense_response
@@ -36,8 +36,6 @@ from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.files import default_cache_dir
 from stillpath.pipeline.options import Options
 from stillpath.simulation.measures import PathDistances, Tally
-
-Array = NDArray[np.float64]
 
 MOVING_KG, PRINT_KG = 0.8, 0.5
 DENSITY_G_CM3 = 12.4

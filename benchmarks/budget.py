@@ -46,13 +46,12 @@ from readback import (
 
 from stillpath.gcode.sampler import sample_phases
 from stillpath.gcode.types import Phases, rows_of
+from stillpath.models.arrays import Array
 from stillpath.models.store import load_machine
 from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.files import default_cache_dir
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.result import BudgetClass
-
-Array = NDArray[np.float64]
 
 SAVED = 0.2
 """Part of the print time that must be saved, geometric mean over all cases."""

@@ -29,7 +29,6 @@ from pathlib import Path
 
 import numpy as np
 from firmwares import machine_with, without_macros
-from numpy.typing import NDArray
 from readback import (
     DT_S,
     WINDOW_S,
@@ -48,6 +47,7 @@ from readback import (
 from scipy.signal import ss2zpk
 
 from stillpath.applications.machines.checks import derived_envelope
+from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
 from stillpath.models.firmware.klipper import Klipper
 from stillpath.models.friction import DryFriction
@@ -69,8 +69,6 @@ from stillpath.simulation.printers.drawing import KINDS, draw
 from stillpath.simulation.printers.machines import Printer
 from stillpath.simulation.printers.resonance_test import NEW_TEST, OLD_TEST, drawn_sensor, run_test
 from stillpath.simulation.response import response
-
-Array = NDArray[np.float64]
 
 FILES = ("ps_voron_klipper_ringing", "klipper_excludeobj_multi")
 BASES = {"bed slinger": "generic-bedslinger", "corexy": "generic-corexy"}

@@ -44,6 +44,7 @@ from stillpath.compensation.basis import BASES
 from stillpath.compensation.fbf import PreviewFbf
 from stillpath.compensation.lifted_window import lifted_window
 from stillpath.compensation.preview import PreviewDesign
+from stillpath.models.arrays import Array
 from stillpath.models.plants import DiscretePlant, Mode, ModesSpec, discretise, plant_set
 from stillpath.models.reference_motion import reference_motion
 from stillpath.models.store import builtin_machines, load_machine
@@ -66,8 +67,6 @@ __all__ = [
     "one_mode",
     "taz",
 ]
-
-Array = NDArray[np.float64]
 
 DT_S = 1e-3
 SHARPNESS = 32
@@ -156,7 +155,6 @@ def limited(design: PreviewDesign, path: Array, z: Array | None = None) -> Array
 
     Parameters
     ----------
-    design : PreviewDesign
     path : ndarray, shape (windows * update + window - update,)
         Planned positions, up to the end of the last window's preview.
     z : ndarray, shape (nz,), optional
@@ -189,11 +187,9 @@ def full_ce_opt(
 
     Parameters
     ----------
-    plant : DiscretePlant
     path : ndarray, shape (axes, n)
     share : float
         Functions per sample.
-    price : float
     q : int
         Sharpness of the cut-off.
     """
@@ -221,11 +217,9 @@ def full_bsplines(plant: DiscretePlant, path: Array, spacing: float, price: floa
 
     Parameters
     ----------
-    plant : DiscretePlant
     path : ndarray, shape (axes, n)
     spacing : float
         Samples from knot to knot.
-    price : float
     """
     degree = 3
     b, a = _fraction(plant)

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Self, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillpath.compensation.shapers import shape_xy
 from stillpath.gcode.firmware.planning import STOPPING, intended, join_phases
@@ -24,6 +23,7 @@ from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.sampler import sample_phases
 from stillpath.gcode.types import Moves, Phases
+from stillpath.models.arrays import Array, Ints, Mask
 from stillpath.models.machine import Machine
 from stillpath.models.plants import plant_set
 from stillpath.models.shaper_pulses import Pulses
@@ -46,9 +46,6 @@ __all__ = [
     "shared_folder",
 ]
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 T = TypeVar("T", Moves, Phases)
 
 DT_S = 1e-4

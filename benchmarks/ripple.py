@@ -16,12 +16,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.feedback.repetitive import InternalModel
 from stillpath.compensation.ripple import PassThrough, RippleCompensator
+from stillpath.models.arrays import Array
 from stillpath.models.identification.ripple import PassLog, WaveBasis, learn_ripple, update_ripple
 from stillpath.models.machine import CommandLimits, Machine
 from stillpath.models.plants import Mode, ModesSpec, PlantSetSpec, continuous
@@ -37,7 +37,6 @@ from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.options import Options
 from stillpath.simulation.response import response
 
-Array = NDArray[np.float64]
 Row = tuple[str, str, str]
 
 DT, FINER, PITCH = 1e-3, 8, 2.0

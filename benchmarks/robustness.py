@@ -26,6 +26,7 @@ from readback import DT_S, Own, find_input, plain_copy, read_motion, shared_fold
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.registry import compensator
 from stillpath.compensation.shapers import SHAPERS, shape_xy, shaper_pulses
+from stillpath.models.arrays import Array
 from stillpath.models.machine import Machine
 from stillpath.models.plants import Mode, ModesSpec, ParametricMembers, PlantSetSpec, plant_set
 from stillpath.models.reference_motion import reference_motion
@@ -34,7 +35,6 @@ from stillpath.pipeline.measuring.reference_shaper import FREQUENCIES_HZ, descen
 from stillpath.simulation.measures import PathDistances, tracking_error
 from stillpath.simulation.response import response
 
-Array = NDArray[np.float64]
 Figure = Callable[[Array], float]
 
 GOLDEN = Path(__file__).parents[1] / "examples" / "machines" / "klipper-golden.json"

@@ -18,7 +18,6 @@ from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
-from numpy.typing import NDArray
 from readback import find_input, plain_copy, shared_folder
 from scipy.optimize import linprog
 
@@ -31,12 +30,11 @@ from stillpath.gcode.segments import (
     fit_segments,
 )
 from stillpath.gcode.timeline import Timeline
+from stillpath.models.arrays import Array
 from stillpath.models.store import load_machine
 from stillpath.pipeline import piece_compensator
 from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.options import Options
-
-Array = NDArray[np.float64]
 
 _MACHINES = ("ender3", "voron-v0", "voron-v24-250", "annex-k3")
 _STRETCHES, _SECONDS = 12, 1.0

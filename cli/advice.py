@@ -9,12 +9,7 @@ import typer
 
 from stillpath.cli.arguments import PlateOption, Refused, check_input, check_output
 
-__all__ = ["register"]
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command to the command line."""
-    app.command()(remove_advice)
+__all__ = ["remove_advice"]
 
 
 def remove_advice(

@@ -8,22 +8,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from stillpath.cli.own_machines import service_settings
 from stillpath.models.errors import ModelError
 
 if TYPE_CHECKING:
     from stillpath.service.settings import Settings
 
-__all__ = ["register"]
+__all__ = ["backup", "migrate", "restore"]
 
 DataDir = Annotated[
     Path | None, typer.Option("--data-dir", help="The service's data [STILLPATH_DATA_DIR].")
 ]
-
-
-def register(app: typer.Typer) -> None:
-    """Add backup, restore and migrate to a command line."""
-    for command in (backup, restore, migrate):
-        app.command()(command)
 
 
 def backup(
@@ -73,26 +68,14 @@ def migrate(data_dir: DataDir = None) -> None:
     from stillpath.service.database.migrations import LATEST
 
     try:
-        open_database(_settings(data_dir)).dispose()
+        open_database(service_settings(data_dir=data_dir)).dispose()
     except StoreError as error:
         raise ModelError(str(error)) from None
     typer.echo(f"schema {LATEST}")
 
 
-def _settings(data_dir: Path | None) -> Settings:
-    from pydantic import ValidationError
-
-    from stillpath.service.settings import Settings
-    from stillpath.service.wrong_options import wrong_setting
-
-    try:
-        return Settings() if data_dir is None else Settings(data_dir=data_dir)
-    except ValidationError as error:
-        raise ModelError(wrong_setting(error)) from None
-
-
 def _of_one_computer(data_dir: Path | None) -> Settings:
-    settings = _settings(data_dir)
+    settings = service_settings(data_dir=data_dir)
     if settings.database_url is not None or settings.storage_url is not None:
         raise ModelError(
             "database or files are not in the data directory (STILLPATH_DATABASE_URL, "

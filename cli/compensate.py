@@ -22,17 +22,10 @@ from stillpath.cli.arguments import (
     check_output,
     chosen_options,
 )
-from stillpath.cli.option_groups import grouped
 from stillpath.cli.own_machines import open_machines
 from stillpath.cli.remote import compensate_on_server
 
-__all__ = ["register"]
-
-
-def register(app: typer.Typer) -> None:
-    """Add compensate and simulate to a command line."""
-    for command in (compensate, simulate):
-        app.command()(grouped(command))
+__all__ = ["compensate", "simulate"]
 
 
 def compensate(

@@ -10,13 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from stillpath.cli.arguments import check_folder, check_output
-from stillpath.cli.option_groups import grouped
 
 if TYPE_CHECKING:
     from stillpath.applications.controllers.design import Designed
     from stillpath.applications.controllers.options import ControllerOptions
 
-__all__ = ["register"]
+__all__ = ["controller", "loops"]
 
 MachineOption = Annotated[
     str | None,
@@ -113,12 +112,6 @@ class OutputOptions:
             write_texts(self.json_file.parent, {self.json_file.name: text})
         if self.c_header is not None:
             write_texts(self.c_header.parent, {self.c_header.name: made.controller.to_c_header()})
-
-
-def register(app: typer.Typer) -> None:
-    """Add controller and loops to a command line."""
-    for command in (controller, loops):
-        app.command()(grouped(command))
 
 
 def controller(

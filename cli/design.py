@@ -11,12 +11,7 @@ from stillpath.cli.arguments import BasisOption, MachineOption, RobustOption, ch
 from stillpath.cli.own_machines import open_machines
 from stillpath.compensation.defaults import DEFAULT_BASIS
 
-__all__ = ["register"]
-
-
-def register(app: typer.Typer) -> None:
-    """Add design to a command line."""
-    app.command()(design)
+__all__ = ["design"]
 
 
 def design(

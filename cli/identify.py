@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 import typer
 
 from stillpath.cli.arguments import check_folder, check_output
-from stillpath.cli.option_groups import grouped
 from stillpath.cli.own_machines import RevisionNote, open_documents, open_machines, who
 from stillpath.models.errors import ModelError
 
@@ -28,7 +27,7 @@ if TYPE_CHECKING:
     Store = Callable[[Machine, Sequence[SourceFile]], Revision | None]
     """Makes a revision of a machine that was measured, if it has a name."""
 
-__all__ = ["register"]
+__all__ = ["identify"]
 
 Files = Annotated[
     list[str],
@@ -162,12 +161,7 @@ class RippleOptions:
     ] = 0.0
 
 
-def register(app: typer.Typer) -> None:
-    """Add identify to a command line."""
-    app.command("identify")(grouped(run))
-
-
-def run(
+def identify(
     files: Files,
     *,
     target: TargetOptions,

@@ -10,27 +10,22 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from stillpath.cli.own_machines import service_settings, who
 from stillpath.models.errors import ModelError
 
 if TYPE_CHECKING:
     from sqlalchemy import Engine
 
-__all__ = ["register"]
+__all__ = ["app", "audit"]
 
 DataDir = Annotated[
     Path | None, typer.Option(help="Of the service, with SQLite [STILLPATH_DATA_DIR].")
 ]
 
-_keys = typer.Typer(help="Keys of the service: who may call it.", rich_markup_mode=None)
+app = typer.Typer(help="Keys of the service: who may call it.", rich_markup_mode=None)
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to the command line."""
-    app.add_typer(_keys, name="keys")
-    app.command()(audit)
-
-
-@_keys.command()
+@app.command()
 def create(
     name: Annotated[str, typer.Argument(help="What it is for: `slicer of Ada`.")],
     owner: Annotated[str, typer.Option(help="Whose jobs its jobs are.")],
@@ -64,7 +59,7 @@ def create(
     typer.echo(f"key {key.id} of {owner}; it cannot be shown again", err=True)
 
 
-@_keys.command("list")
+@app.command("list")
 def list_keys(data_dir: DataDir = None) -> None:
     """List the keys, without the keys themselves."""
     with _opened(data_dir) as engine:
@@ -85,7 +80,7 @@ def list_keys(data_dir: DataDir = None) -> None:
     _print_table(("id", "owner", "name", "scopes", "made", "expires", "last use", "revoked"), rows)
 
 
-@_keys.command()
+@app.command()
 def revoke(
     key_id: Annotated[str, typer.Argument(metavar="ID", help="From `stillpath keys list`.")],
     data_dir: DataDir = None,
@@ -99,7 +94,7 @@ def revoke(
     typer.echo(f"key {key.id} of {key.owner} is revoked")
 
 
-@_keys.command()
+@app.command()
 def first(data_dir: DataDir = None) -> None:
     """Make the first key, with all scopes, before the service's first start, and print it."""
     with _opened(data_dir) as engine:
@@ -143,17 +138,10 @@ def audit(
 
 @contextmanager
 def _opened(data_dir: Path | None) -> Iterator[Engine]:
-    from pydantic import ValidationError
-
     from stillpath.service.database.engine import StoreError, open_database
     from stillpath.service.security.keys import KeyRefused
-    from stillpath.service.settings import Settings
-    from stillpath.service.wrong_options import wrong_setting
 
-    try:
-        settings = Settings() if data_dir is None else Settings(data_dir=data_dir)
-    except ValidationError as error:
-        raise ModelError(wrong_setting(error)) from None
+    settings = service_settings(data_dir=data_dir)
     try:
         engine = open_database(settings)
         try:
@@ -172,7 +160,6 @@ def _store(engine: Engine) -> Any:
 
 def _note(engine: Engine, action: str, key: Any) -> None:
     """Write into the audit log what was done here, by whoever may read the database."""
-    from stillpath.cli.own_machines import who
     from stillpath.service.security.audit import AuditLog
     from stillpath.service.security.callers import LOCAL, Caller
 

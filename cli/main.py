@@ -38,6 +38,7 @@ from stillpath.cli import (
 from stillpath.cli.arguments import Refused
 from stillpath.cli.batch import commands as batch
 from stillpath.cli.groups import GroupedCommands
+from stillpath.cli.option_groups import grouped
 from stillpath.service.environment import prepare_environment
 from stillpath.service.interruption import Interrupted
 
@@ -146,13 +147,30 @@ def _root(
         typer.echo(context.get_help())
 
 
-app.add_typer(machines.app, name="machines")
-app.add_typer(klipper.app, name="klipper")
-for _commands in (
-    *(advice, backup, batch, compensate, controllers, design, identify, keys, printers, proof),
-    *(remote, scan, serve, trajectories, warm),
+for _name, _group in (
+    ("machines", machines.app),
+    ("klipper", klipper.app),
+    ("keys", keys.app),
+    ("printers", printers.app),
+    ("jobs", remote.app),
 ):
-    _commands.register(app)
+    app.add_typer(_group, name=_name)
+for _command in (
+    advice.remove_advice,
+    *(backup.backup, backup.restore, backup.migrate),
+    *(batch.batch, batch.watch),
+    *(compensate.compensate, compensate.simulate),
+    *(controllers.controller, controllers.loops),
+    design.design,
+    identify.identify,
+    keys.audit,
+    *(proof.coupon, proof.tower, proof.ring_test, proof.motor_test, proof.verify),
+    scan.scan,
+    *(serve.serve, serve.scheduler, serve.worker),
+    *(trajectories.plan, trajectories.trajectories),
+    warm.warm,
+):
+    app.command()(grouped(_command))
 
 
 def _is_ours(error: ValueError) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
@@ -18,7 +18,16 @@ if TYPE_CHECKING:
     from stillpath.applications.machines.settings import MachineSettings
     from stillpath.service.settings import Settings
 
-__all__ = ["By", "Message", "RevisionNote", "data_dir", "open_documents", "open_machines", "who"]
+__all__ = [
+    "By",
+    "Message",
+    "RevisionNote",
+    "data_dir",
+    "open_documents",
+    "open_machines",
+    "service_settings",
+    "who",
+]
 
 _Made = TypeVar("_Made")
 
@@ -59,7 +68,7 @@ def open_documents(name: str) -> Documents:
     if _settings().database_url is not None:
         from stillpath.service.database import documents, engine
 
-        settings = _service_settings()
+        settings = service_settings()
         if engine.database_url(settings).get_backend_name() != "sqlite":
             # Without a pool nothing is left open after a command.
             return documents.DocumentTable(engine.open_database(settings, pooled=False), name)
@@ -71,6 +80,13 @@ def data_dir() -> Path:
     from stillpath.applications.machines.settings import user_data_dir
 
     return _settings().data_dir or user_data_dir()
+
+
+def service_settings(**given: Any) -> Settings:
+    """Return the settings of the service: those given that are not None, else the environment's."""
+    from stillpath.service.settings import Settings
+
+    return _checked(Settings, **{name: value for name, value in given.items() if value is not None})
 
 
 def who(by: str | None) -> str:
@@ -91,18 +107,12 @@ def _settings() -> MachineSettings:
     return _checked(MachineSettings.from_environment)
 
 
-def _service_settings() -> Settings:
-    from stillpath.service.settings import Settings
-
-    return _checked(Settings)
-
-
-def _checked(make: Callable[[], _Made]) -> _Made:
+def _checked(make: Callable[..., _Made], **given: Any) -> _Made:
     from pydantic import ValidationError
 
     from stillpath.service.wrong_options import wrong_setting
 
     try:
-        return make()
+        return make(**given)
     except ValidationError as error:
         raise ModelError(wrong_setting(error)) from None

@@ -13,7 +13,7 @@ from stillpath.models.errors import ModelError
 if TYPE_CHECKING:
     from stillpath.service.deliveries.checking import PrinterCheck
 
-__all__ = ["register"]
+__all__ = ["app"]
 
 Name = Annotated[str, typer.Argument(metavar="NAME", help="A section [printer.NAME] of the file.")]
 FileOption = Annotated[
@@ -26,17 +26,12 @@ FileOption = Annotated[
     ),
 ]
 
-_printers = typer.Typer(
+app = typer.Typer(
     help="Printers that results are sent to.", rich_markup_mode=None, no_args_is_help=True
 )
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to the command line."""
-    app.add_typer(_printers, name="printers")
-
-
-@_printers.command()
+@app.command()
 def check(
     name: Name, printers: FileOption = None, server: ServerOption = None, key: KeyOption = None
 ) -> None:
@@ -49,7 +44,7 @@ def check(
     typer.echo(f"{name}: as the machine {found.machine} says ({found.software})")
 
 
-@_printers.command()
+@app.command()
 def accept(
     name: Name, printers: FileOption = None, server: ServerOption = None, key: KeyOption = None
 ) -> None:

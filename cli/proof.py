@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from stillpath.cli.arguments import MachineOption, check_folder, check_output
-from stillpath.cli.option_groups import grouped
 from stillpath.cli.own_machines import By, Message, open_machines, who
 
 if TYPE_CHECKING:
@@ -18,7 +17,7 @@ if TYPE_CHECKING:
     from stillpath.applications.proof.ring_figures import RingReport
     from stillpath.models.machine import Machine
 
-__all__ = ["register"]
+__all__ = ["coupon", "motor_test", "ring_test", "tower", "verify"]
 
 Output = Annotated[
     Path, typer.Option("--output", "-o", metavar="OUT", dir_okay=False, help="The file to write.")
@@ -64,12 +63,6 @@ class PrintOptions:
             start_gcode=_text(self.start_gcode),
             end_gcode=_text(self.end_gcode),
         )
-
-
-def register(app: typer.Typer) -> None:
-    """Add coupon, tower, ring-test, motor-test and verify to a command line."""
-    for command in (coupon, tower, ring_test, motor_test, verify):
-        app.command()(grouped(command))
 
 
 def coupon(

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from stillpath.service.api.schemas import JobView
     from stillpath.service.client import Client
 
-__all__ = ["compensate_on_server", "register"]
+__all__ = ["app", "compensate_on_server"]
 
 Id = Annotated[str, typer.Argument(metavar="JOB", help="As `stillpath jobs list` names it.")]
 Output = Annotated[
@@ -35,11 +35,6 @@ app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode=None,
 )
-
-
-def register(parent: typer.Typer) -> None:
-    """Add the commands to the command line."""
-    parent.add_typer(app, name="jobs")
 
 
 def compensate_on_server(

@@ -10,13 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from stillpath.cli.arguments import check_folder, check_output
-from stillpath.cli.option_groups import grouped
 
 if TYPE_CHECKING:
     from stillpath.applications.scanning.scan import ScanSettings
     from stillpath.models.disturbances import DisturbanceSpec
 
-__all__ = ["register"]
+__all__ = ["scan"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,11 +68,6 @@ class DrawingOptions:
             enters=self.enters,
             disturbance_um=self.disturbance_um,
         )
-
-
-def register(app: typer.Typer) -> None:
-    """Add scan to a command line."""
-    app.command()(grouped(scan))
 
 
 def scan(

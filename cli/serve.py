@@ -7,22 +7,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from stillpath.cli.own_machines import service_settings
+from stillpath.models.errors import ModelError
+
 if TYPE_CHECKING:
     from stillpath.service.settings import Settings
 
-__all__ = ["register"]
+__all__ = ["scheduler", "serve", "worker"]
 
 DataOption = Annotated[
     Path | None, typer.Option(help="Database, uploads, results [STILLPATH_DATA_DIR].")
 ]
 WorkersOption = Annotated[int | None, typer.Option(help="Worker processes [STILLPATH_WORKERS].")]
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands."""
-    app.command()(serve)
-    app.command()(scheduler)
-    app.command()(worker)
 
 
 def serve(
@@ -100,12 +96,7 @@ def _check_storage(settings: Settings) -> None:
 
 
 def _settings(**given: Any) -> Settings:
-    from pydantic import ValidationError
-
-    from stillpath.service.settings import Settings
-    from stillpath.service.wrong_options import wrong_setting
-
     try:
-        return Settings(**{name: value for name, value in given.items() if value is not None})
-    except ValidationError as error:
-        raise typer.TyperException(wrong_setting(error)) from None
+        return service_settings(**given)
+    except ModelError as error:
+        raise typer.TyperException(str(error)) from None

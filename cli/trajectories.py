@@ -23,13 +23,7 @@ from stillpath.cli.arguments import (
 from stillpath.cli.own_machines import open_machines
 from stillpath.compensation.defaults import DEFAULT_METHOD
 
-__all__ = ["register"]
-
-
-def register(app: typer.Typer) -> None:
-    """Add plan and trajectories to a command line."""
-    for command in (plan, trajectories):
-        app.command()(command)
+__all__ = ["plan", "trajectories"]
 
 
 def trajectories(

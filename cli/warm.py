@@ -15,12 +15,7 @@ from stillpath.cli.arguments import MachineOption, check_input
 if TYPE_CHECKING:
     from stillpath.models.machine import Machine
 
-__all__ = ["register"]
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command to the command line."""
-    app.command()(warm)
+__all__ = ["warm"]
 
 
 def warm(

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array
 from stillpath.models.jit import kernel
 
 __all__ = ["BLOCK", "add_row", "backward", "factorise", "forward", "weighted_gram"]
-
-Array = NDArray[np.float64]
 
 BLOCK = 20
 """Samples between two running Gram matrices."""

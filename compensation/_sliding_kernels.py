@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array
 from stillpath.models.jit import kernel
 
 __all__ = ["contour_square", "move_targets", "nearest_point"]
-
-Array = NDArray[np.float64]
 
 
 @kernel

@@ -15,6 +15,7 @@ from stillpath.compensation._least_squares_kernels import (
     weighted_gram,
 )
 from stillpath.compensation._preview_kernels import advance_window, run_windows
+from stillpath.models.arrays import Array, Ints
 from stillpath.models.jit import kernel
 
 __all__ = [
@@ -29,8 +30,6 @@ __all__ = [
     "tied_window",
 ]
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
 
@@ -319,9 +318,12 @@ def _tied_problem(
 
     Parameters
     ----------
-    functions : Functions
-    z, targets, weight
-        As in `compensation.window_problem.solve_window`.
+    z : ndarray, shape (nz,)
+        Member states and the last two commands.
+    targets : ndarray, shape (components, window)
+        Target of each component of the set: `lifted.target` times the path, or close to it.
+    weight : ndarray, shape (window,)
+        Weight of the errors.
     moving : ndarray of int64, shape (k, 2)
         Segments [s, e) between rests; some may be empty.
 

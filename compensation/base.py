@@ -21,7 +21,6 @@ class Compensator(Protocol):
 
     Attributes
     ----------
-    name : str
     lead_s, tail_s : float
         Standstill that it needs before and after every stretch of motion; 0 if the command stands
         on the plan in every rest.

@@ -12,11 +12,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.lifted import LiftedSet
 from stillpath.compensation.operators import LiftedOperator
+from stillpath.models.arrays import Array
 
 __all__ = [
     "BASES",
@@ -35,7 +35,6 @@ __all__ = [
     "spread_functions",
 ]
 
-Array = NDArray[np.float64]
 Basis = Callable[[LiftedSet, int], Array]
 
 TOLERANCE = 1e-7
@@ -71,8 +70,6 @@ def bspline_basis(samples: int, n: int, degree: int = 3) -> Array:
 
     Parameters
     ----------
-    samples : int
-        Length of the window.
     n : int
         Number of functions, at least ``degree + 1``.
     degree : int

@@ -17,12 +17,11 @@ from stillpath.compensation.base import DesignError
 from stillpath.compensation.fbf import PreviewFbf
 from stillpath.compensation.preview_axis import GENTLE_RUNG
 from stillpath.compensation.shapers import ShaperCompensator
+from stillpath.models.arrays import Array
 from stillpath.models.machine import Machine
 from stillpath.models.schedule import OperatingPoint
 
 __all__ = ["Caution", "CautiousFbf"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,8 +32,6 @@ class Caution:
     ----------
     shares : (float, float)
         For X and Y, 0 (the shaper alone) to 1.
-    shaper : str
-    fx_hz, fy_hz : float
     fit_share : float
         Share of the tolerance that a fit to the command may use.
     """
@@ -51,13 +48,6 @@ class CautiousFbf:
 
     A shaper needs no more than the path: where the motors cannot follow any command of filtered
     basis functions, or only one that is less accurate, the shaper's is used.
-
-    Parameters
-    ----------
-    inner : PreviewFbf
-    machine : Machine
-    dt_s : float
-    caution : Caution
 
     Raises
     ------

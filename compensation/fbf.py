@@ -37,14 +37,13 @@ from stillpath.compensation.preview_axis import (
 )
 from stillpath.compensation.sliding import balanced_weights, slide
 from stillpath.compensation.window_problem import Bounds, Extremes
+from stillpath.models.arrays import Array, Ints
 from stillpath.models.machine import Machine, MotorLimits
 from stillpath.models.plants import DiscretePlant, PlantSet, plant_set
 from stillpath.models.schedule import OperatingPoint
 
 __all__ = ["LADDER", "ROBUST", "UPDATE_S", "WINDOW_S", "PreviewFbf", "Rung"]
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 _Found: TypeAlias = tuple[AxisCommand, int, frozenset[int]]
 """Command of an axis, its rung, and the windows solved within bounds."""
 
@@ -88,7 +87,6 @@ class PreviewFbf:
     ----------
     lifted : tuple of LiftedWindow
         Plants and weights for which X and Y are designed.
-    along : float
     rungs : tuple of int
         Rungs of the ladders (`LADDER`, within the models' bands) used by the last command, X and Y.
 

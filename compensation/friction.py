@@ -17,12 +17,11 @@ from stillpath.compensation.base import Compensator
 from stillpath.compensation.limits import eased, smoothed, window
 from stillpath.compensation.overlay import Overlay
 from stillpath.compensation.rests import stand_still
+from stillpath.models.arrays import Array
 from stillpath.models.friction import bend_of
 from stillpath.models.machine import Machine
 
 __all__ = ["FrictionCompensator", "against_friction"]
-
-Array = NDArray[np.float64]
 
 _ROUNDED_S = (4e-3, 8e-3, 16e-3)
 """Lengths of the smoothing window: around each place, the first that keeps the machine's limits."""
@@ -68,7 +67,6 @@ class FrictionCompensator(Overlay):
         Compensates vibration: its command is what the axes should receive.
     machine : Machine
         With friction in its axes.
-    dt_s : float
     """
 
     def __init__(self, inner: Compensator, machine: Machine, dt_s: float) -> None:

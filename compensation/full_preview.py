@@ -11,13 +11,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.linalg import solve_triangular, svdvals
 
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.basis import TOLERANCE
 from stillpath.compensation.lifted import LiftedSet, checked_weights, free_response, lift
 from stillpath.compensation.operators import LiftedOperator
+from stillpath.models.arrays import Array
 from stillpath.models.plants import DiscretePlant
 
 __all__ = [
@@ -27,8 +28,6 @@ __all__ = [
     "Solvability",
     "independence",
 ]
-
-Array = NDArray[np.float64]
 
 RANK_TOLERANCE = 1e-12
 """Filtered functions count as dependent below this singular value, relative to the largest."""
@@ -194,7 +193,6 @@ class FullPreview:
         Parameters
         ----------
         y_d : array_like, shape (rows,)
-        counts : sequence of int
 
         Returns
         -------
@@ -288,7 +286,6 @@ def independence(plant: DiscretePlant, basis: Array, states: Array | None = None
 
     Parameters
     ----------
-    plant : DiscretePlant
     basis : ndarray, shape (m, n)
     states : ndarray, shape (order, n), optional
         Initial states X of the filters; zero by default.

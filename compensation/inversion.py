@@ -37,11 +37,11 @@ from scipy.linalg import toeplitz
 from scipy.signal import lfilter, sosfilt, zpk2sos
 
 from stillpath.compensation.base import DesignError
+from stillpath.models.arrays import Array
 from stillpath.models.plants import DiscretePlant
 
 __all__ = ["KINDS", "NEAR_CIRCLE", "Inversion", "TwoSidedFilter", "invert"]
 
-Array = NDArray[np.float64]
 Roots = NDArray[np.complex128]
 
 NEAR_CIRCLE = 5e-4
@@ -197,7 +197,6 @@ def invert(
     ----------
     kind : str
         A key of `KINDS`.
-    plant : DiscretePlant
     order : int
         n1: additional terms of ``ebzpetc`` (0 is ``zpetc``), terms of ``ts``.
     cancel_below : float

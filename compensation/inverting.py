@@ -15,12 +15,11 @@ from numpy.typing import NDArray
 from stillpath.compensation.base import DesignError, Memoryless
 from stillpath.compensation.inversion import Inversion, invert
 from stillpath.compensation.rests import stand_still
+from stillpath.models.arrays import Array
 from stillpath.models.machine import Machine
 from stillpath.models.plants import DiscretePlant, plant_set
 
 __all__ = ["InversionCompensator", "zero_phase_fir"]
-
-Array = NDArray[np.float64]
 
 _FASTEST_HZ, _SLOWEST_HZ, _STEP = 400.0, 15.0, 0.85
 _BLEND_S = 0.03
@@ -55,8 +54,6 @@ class InversionCompensator(Memoryless):
 
     Parameters
     ----------
-    machine : Machine
-    dt_s : float
     kind : str
         A key of `compensation.inversion.KINDS`.
     order : int or None

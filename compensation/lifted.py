@@ -10,10 +10,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.operators import LiftedOperator, TimeVaryingOperator, ToeplitzOperator
+from stillpath.models.arrays import Array
 from stillpath.models.plants import DiscretePlant
 
 __all__ = [
@@ -26,8 +27,6 @@ __all__ = [
     "lifted_set_of",
     "time_varying",
 ]
-
-Array = NDArray[np.float64]
 
 _WEIGHT_SUM = 1e-9
 """Tolerance of the sum 1 of weights."""

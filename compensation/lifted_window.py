@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag, toeplitz
 
 from stillpath.compensation.base import DesignError
@@ -24,11 +23,10 @@ from stillpath.compensation.lifted import (
     integrated,
     lifted_set,
 )
+from stillpath.models.arrays import Array
 from stillpath.models.plants import DiscretePlant
 
 __all__ = ["Condensed", "LiftedWindow", "condensed", "lifted_window"]
-
-Array = NDArray[np.float64]
 
 _TOLERANCE = 1e-5
 """Components below this share of the largest are dropped: .1 um of a 10 mm move."""
@@ -50,7 +48,6 @@ class LiftedWindow:
 
     Attributes
     ----------
-    plants : tuple of DiscretePlant
     weights : ndarray, shape (l,)
     update : int
         Samples that are committed before the next window starts.
@@ -112,7 +109,6 @@ def lifted_window(
 
     Parameters
     ----------
-    plants : sequence of DiscretePlant
     weights : sequence of float
         Weights of the members, positive, sum 1.
     window, update : int

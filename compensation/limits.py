@@ -5,15 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 
+from stillpath.models.arrays import Array, Mask
 from stillpath.models.machine import Machine
 
 __all__ = ["CommandBounds", "eased", "smoothed", "window"]
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _ROUNDED = 1.0 + 1e-9
 _REACH_S = 0.032
@@ -25,7 +22,6 @@ class CommandBounds:
 
     Parameters
     ----------
-    machine : Machine
     dt_s : float
         Sampling time of the commands.
     """

@@ -15,12 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter1d
 
+from stillpath.models.arrays import Array
 from stillpath.models.plants import DiscretePlant
 from stillpath.models.shaper_pulses import Pulses
 
 __all__ = ["FADE", "REACH", "LiveFilter", "design_taps", "shaper_taps"]
-
-Array = NDArray[np.float64]
 
 REACH = 80
 """Taps on either side, samples of 1 ms."""

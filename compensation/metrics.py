@@ -9,11 +9,12 @@ basis functions; n counts functions, the paper's n + 1.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.lifted import LiftedSet
 from stillpath.compensation.operators import LiftedOperator
+from stillpath.models.arrays import Array
 
 __all__ = [
     "best_number",
@@ -26,8 +27,6 @@ __all__ = [
     "robust_error_of_spread",
     "toeplitz_metric",
 ]
-
-Array = NDArray[np.float64]
 
 
 def error_metric(plant: LiftedOperator, controller: Array) -> float:
@@ -55,7 +54,6 @@ def effort_of_ce_opt(singular_values: ArrayLike, n: int) -> float:
     ----------
     singular_values : array_like, shape (samples,)
         Of the lifted plant, falling.
-    n : int
 
     Raises
     ------

@@ -15,14 +15,13 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from stillpath.compensation.base import DesignError
+from stillpath.models.arrays import Array
 from stillpath.models.plants import PlantSet
 
 __all__ = ["guarded_weights", "member_errors", "path_spectrum", "worst_case_weights"]
-
-Array = NDArray[np.float64]
 
 _LOWEST_HZ, _HIGHEST_HZ = 2.0, 150.0
 _POINTS = 600

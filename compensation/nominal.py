@@ -9,16 +9,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.basis import TOLERANCE, orthonormal, robust_functions, spread_functions
 from stillpath.compensation.lifted import LiftedSet
 from stillpath.compensation.metrics import best_number
+from stillpath.models.arrays import Array
 
 __all__ = ["PSEUDO_INVERSE_TOLERANCE", "TwoStep", "lifted_optimum", "spread_gram", "two_step"]
-
-Array = NDArray[np.float64]
 
 PSEUDO_INVERSE_TOLERANCE = 1e-10
 """Singular values of B below this share of the largest are zero in the pseudo-inverse of (4.28)."""

@@ -33,6 +33,7 @@ from numpy.typing import ArrayLike, NDArray
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.lifted import checked_weights
 from stillpath.compensation.operators import ToeplitzOperator
+from stillpath.models.arrays import Array
 from stillpath.models.plants import DiscretePlant
 
 __all__ = [
@@ -47,7 +48,6 @@ __all__ = [
     "sampled_responses",
 ]
 
-Array = NDArray[np.float64]
 Responses = NDArray[np.complex128]
 Distribution = Literal["sampled", "uniform", "kernel"]
 _Integrands = Callable[[Array], Responses]
@@ -198,8 +198,6 @@ def extended_response(
     ----------
     f_hz, response : array_like, shape (k,)
         Rising frequencies and the measured response.
-    outside : DiscretePlant
-    points : int
 
     Raises
     ------

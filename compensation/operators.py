@@ -18,6 +18,7 @@ from scipy.linalg import toeplitz
 
 from stillpath.compensation._lifted_kernels import run_adjoint, run_forward
 from stillpath.compensation.base import DesignError
+from stillpath.models.arrays import Array
 
 if TYPE_CHECKING:
     from scipy.sparse.linalg import LinearOperator
@@ -31,7 +32,6 @@ __all__ = [
     "ToeplitzOperator",
 ]
 
-Array = NDArray[np.float64]
 _Product = Callable[[Array], Array]
 
 _COLUMNS = 64

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
 from stillpath.compensation.base import Compensator
 from stillpath.compensation.limits import CommandBounds
+from stillpath.models.arrays import Array
 from stillpath.models.machine import Machine
 from stillpath.models.schedule import OperatingPoint
 
 __all__ = ["Overlay"]
-
-Array = NDArray[np.float64]
 
 
 class Overlay:
@@ -23,10 +19,8 @@ class Overlay:
 
     Parameters
     ----------
-    inner : Compensator
     machine : Machine
         Source of the command limits.
-    dt_s : float
     """
 
     name: str

@@ -25,10 +25,9 @@ from stillpath.compensation.base import DesignError
 from stillpath.compensation.basis import BASES
 from stillpath.compensation.defaults import DEFAULT_BASIS
 from stillpath.compensation.lifted_window import LiftedWindow
+from stillpath.models.arrays import Array
 
 __all__ = ["MAX_CONDITION", "MAX_SPECTRAL_RADIUS", "PreviewDesign", "running_gram"]
-
-Array = NDArray[np.float64]
 
 MAX_SPECTRAL_RADIUS = 0.9
 MAX_CONDITION = 1e10

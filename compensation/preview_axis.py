@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillpath.compensation._preview_kernels import advance_state, advance_window, impulse_states
 from stillpath.compensation._window_kernels import Functions, Memory, Stepping, solve_windows
@@ -22,6 +21,7 @@ from stillpath.compensation.window_problem import (
     refusing_singular,
     within_bounds,
 )
+from stillpath.models.arrays import Array, Ints
 from stillpath.models.plants import DiscretePlant
 from stillpath.models.response_kernels import dense_response
 
@@ -39,9 +39,6 @@ __all__ = [
     "designs",
     "functions_within",
 ]
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +90,6 @@ class AxisTask:
     stops : ndarray of int64, shape (k, 2)
         Ranges [a, b) of samples in which the command stands, including those before and after the
         piece.
-    bounds : Bounds
     rms_limit_mm_s2 : float
         Largest rms acceleration of a command that counts as smooth.
     """
@@ -126,8 +122,6 @@ class _Drive:
 
     Attributes
     ----------
-    task : AxisTask
-    rung : int
     path_mm, weight : ndarray, shape (windows * update + window,)
         Those of the task, relative to the start of the path, extended beyond its end.
     targets_mm : ndarray, shape (components, windows * update + window)
@@ -154,7 +148,6 @@ class Designs:
 
     Attributes
     ----------
-    lifted : LiftedWindow
     ladder : tuple of Rung
         `LADDER` with at most as many functions as the model's band allows; equal rungs are merged.
     at_rests : Condensed
@@ -335,7 +328,6 @@ class PreviewAxis:
         ----------
         rung : int
             Index into `Designs.ladder`.
-        task : AxisTask
         careful : set of int
             Windows in which the bounds are kept.
         targets_mm : ndarray, shape (members, n), optional

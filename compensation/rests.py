@@ -12,9 +12,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["stand_still"]
+from stillpath.models.arrays import Array
 
-Array = NDArray[np.float64]
+__all__ = ["stand_still"]
 
 
 def stand_still(u_mm: Array, y_d_mm: Array, rests: NDArray[np.int64], blend: int) -> Array:

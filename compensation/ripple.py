@@ -27,6 +27,7 @@ from stillpath.compensation.base import Compensator, DesignError, Memoryless
 from stillpath.compensation.inversion import Inversion, invert
 from stillpath.compensation.overlay import Overlay
 from stillpath.compensation.rests import stand_still
+from stillpath.models.arrays import Array
 from stillpath.models.machine import Machine
 from stillpath.models.plants import DiscretePlant, plant_set
 from stillpath.models.ripple import MachineRipple, RippleTable
@@ -38,8 +39,6 @@ __all__ = [
     "output_command",
     "wave_shares",
 ]
-
-Array = NDArray[np.float64]
 
 _STEPS = (1.0, 0.5, 0.25, 0.125, 0.0625, 0.03125)
 """Acceleration allowed to a wave, as shares of the machine's limit, tried in turn."""
@@ -60,7 +59,6 @@ def input_command(wanted_mm: Array, table: RippleTable, share: Array | None = No
     Parameters
     ----------
     wanted_mm : ndarray, shape (n,)
-    table : RippleTable
     share : ndarray, shape (len(table), n), optional
         Share of every wave; see `wave_shares`.
 
@@ -170,7 +168,6 @@ class RippleCompensator(Overlay):
         Compensates vibration: its command is what the axes should receive.
     machine : Machine
         With its ripple.
-    dt_s : float
 
     Raises
     ------

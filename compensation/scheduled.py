@@ -15,13 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillpath.compensation.base import Compensator, DesignError
+from stillpath.models.arrays import Array
 from stillpath.models.machine import Machine
 from stillpath.models.operating import OperatingGrid, machine_at
 from stillpath.models.schedule import EMPTY, OperatingPoint
 
 __all__ = ["BLEND_STEP", "DESIGN_STEP", "REMEMBERED_S", "ScheduledCompensator"]
-
-Array = NDArray[np.float64]
 
 DESIGN_STEP = 0.02
 """Relative change of a resonance between neighbouring designs in mass and height."""
@@ -42,7 +41,6 @@ class ScheduledCompensator:
         With schedules.
     make : callable
         Makes the compensator of a machine without schedules.
-    dt_s : float
 
     Attributes
     ----------

@@ -15,14 +15,13 @@ from stillpath.compensation._shaper_kernels import add_delayed
 from stillpath.compensation.base import DesignError, Memoryless
 from stillpath.compensation.rests import stand_still
 from stillpath.models import shaper_pulses as firmware
+from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
 from stillpath.models.plants import plant_set
 from stillpath.models.shaper_pulses import SHAPERS, Pulses
 
 __all__ = ["SHAPERS", "ShaperCompensator", "shape", "shape_xy", "shaper_pulses"]
-
-Array = NDArray[np.float64]
 
 
 def shaper_pulses(name: str, f_hz: float, zeta: float = 0.1) -> Pulses:
@@ -87,12 +86,8 @@ class ShaperCompensator(Memoryless):
 
     Parameters
     ----------
-    machine : Machine
-    dt_s : float
-    shaper : str
     fx_hz, fy_hz : float, optional
         Default: the resonance of the nominal plant that rings most.
-    zeta : float
     """
 
     def __init__(

@@ -27,12 +27,12 @@ from stillpath.compensation.preview_axis import (
     PreviewAxis,
 )
 from stillpath.compensation.window_problem import Bounds
+from stillpath.models.arrays import Array
 from stillpath.models.plants import DiscretePlant
 from stillpath.models.reference_motion import reference_motion
 
 __all__ = ["balanced_weights", "slide"]
 
-Array = NDArray[np.float64]
 Choice = tuple[int, frozenset[int]]
 
 ROUNDS = 4
@@ -67,7 +67,6 @@ def slide(
     extruding : ndarray of bool, shape (n,)
     along : float
         Weight of the error along the path against that across it.
-    dt_s : float
 
     Returns
     -------

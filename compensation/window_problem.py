@@ -19,7 +19,6 @@ from typing import NamedTuple
 
 import daqp
 import numpy as np
-from numpy.typing import NDArray
 
 from stillpath.compensation._window_kernels import (
     Functions,
@@ -27,11 +26,11 @@ from stillpath.compensation._window_kernels import (
     command_of,
     constraints_at,
     extremes,
-    tied_window,
 )
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.lifted_window import Condensed
 from stillpath.compensation.preview import PreviewDesign, running_gram
+from stillpath.models.arrays import Array
 
 __all__ = [
     "EFFORT_PRICE",
@@ -40,11 +39,8 @@ __all__ = [
     "Extremes",
     "functions_of",
     "refusing_singular",
-    "solve_window",
     "within_bounds",
 ]
-
-Array = NDArray[np.float64]
 
 EFFORT_PRICE = 0.5
 """Weight of squared increments (mm/sample^2)^2 relative to squared error mm^2 at rests."""
@@ -123,44 +119,6 @@ class Extremes(NamedTuple):
         return cls(*extremes(command, last, previous, stops))
 
 
-def solve_window(
-    design: PreviewDesign,
-    z: Array,
-    path_mm: Array,
-    targets_mm: Array,
-    weight: Array,
-    rests: NDArray[np.int64],
-    bounds: Bounds,
-) -> Array:
-    """Return the command of one window that stands still in the given rests.
-
-    Parameters
-    ----------
-    design : PreviewDesign
-        Gains and lifted plants of the axis.
-    z : ndarray, shape (nz,)
-        Member states and the last two commands.
-    path_mm : ndarray, shape (window,)
-        Planned positions, on which the command stands in the rests.
-    targets_mm : ndarray, shape (components, window)
-        Target of each component of the set: `lifted.target` times the path, or close to it.
-    weight : ndarray, shape (window,)
-        Weight of the errors.
-    rests : ndarray of int64, shape (k, 2)
-        Ranges [a, b) of samples, relative to the window, in which u(i) = u(i - 1) = path(i - 1).
-    bounds : Bounds
-        Kept if possible; the caller checks.
-
-    Returns
-    -------
-    ndarray, shape (window,)
-    """
-    functions = functions_of(design, at_rests=len(rests) > 0)
-    with refusing_singular():
-        tied = tied_window(functions, z, path_mm, targets_mm, weight, rests, bounds.limits())
-    return tied.command if tied.kept else within_bounds(functions, tied, z, path_mm, bounds)
-
-
 @contextlib.contextmanager
 def refusing_singular() -> Iterator[None]:
     """Turn a singular window problem into a DesignError."""
@@ -206,12 +164,15 @@ def within_bounds(
 
     Parameters
     ----------
-    functions : Functions
     tied : Tied
         Its solution without bounds. In the coordinates w = L' c, normal = L L', the cost is
         |w - wish|^2: well conditioned even where a rest leaves few samples.
-    z, path_mm, bounds
-        As in `solve_window`.
+    z : ndarray, shape (nz,)
+        Member states and the last two commands.
+    path_mm : ndarray, shape (window,)
+        Planned positions, on which the command stands in the rests.
+    bounds : Bounds
+        Kept if possible; the caller checks.
     """
     command, rows, low, high = tied.command, tied.pinned, tied.values, tied.values
     last, previous = float(z[-2]), float(z[-1])

@@ -7,11 +7,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array
 from stillpath.models.jit import kernel
 
 __all__ = ["Plan", "distances", "sweep", "visit"]
-
-Array = NDArray[np.float64]
 
 
 class Plan(NamedTuple):

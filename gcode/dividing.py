@@ -50,7 +50,6 @@ def divided(piece: Piece, wanted: NDArray[np.bool_], machine: Machine) -> Iterat
 
     Parameters
     ----------
-    piece : Piece
     wanted : ndarray of bool, shape (len(sections(piece)),)
         Neighbours that are wanted stay one piece, with the rests between them.
 

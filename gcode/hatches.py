@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.lexer import split_classic
+from stillpath.models.arrays import Array
 
 __all__ = ["Hatches", "ScanSamples", "Timing", "read_hatches", "sample_hatches"]
-
-Array = NDArray[np.float64]
 
 _INCH_MM = 25.4
 _TURN_COSINE = math.cos(math.radians(45))

@@ -58,10 +58,8 @@ class Interpreter:
 
     Attributes
     ----------
-    feature_names, object_names : list of str
-        Names behind the `feature` and `object_id` columns.
-    layer_z_mm : list of float
-        Height of each layer as the slicer's marks say; NaN where they do not.
+    feature_names : list of str
+        Names behind the `feature` column.
 
     Notes
     -----
@@ -94,16 +92,6 @@ class Interpreter:
     def feature_names(self) -> list[str]:
         """Names behind the `feature` column."""
         return self.state.features.names
-
-    @property
-    def object_names(self) -> list[str]:
-        """Names behind the `object_id` column."""
-        return self.state.objects.names
-
-    @property
-    def layer_z_mm(self) -> list[float]:
-        """Height of each layer by the slicer's marks; NaN where they lack it."""
-        return [float(z) for z in self.state.tables.layer_z[: int(self.state.i[at.I_LAYER]) + 1]]
 
     @property
     def warnings(self) -> list[str]:

@@ -75,7 +75,6 @@ def check_line_ends(text: bytes, line: int, dialect: Dialect) -> None:
         Whole lines.
     line : int
         Number of the first.
-    dialect : Dialect
 
     Raises
     ------
@@ -101,7 +100,6 @@ def split_line(text: str, dialect: Dialect) -> list[Command]:
     ----------
     text : str
         The line, with or without its newline.
-    dialect : Dialect
 
     Raises
     ------

@@ -20,6 +20,7 @@ from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.pieces import Piece
 from stillpath.gcode.plan import plan_moves
 from stillpath.gcode.types import Moves
+from stillpath.models.arrays import Mask
 from stillpath.models.machine import CommandLimits, Machine
 
 __all__ = [
@@ -34,7 +35,6 @@ __all__ = [
 ]
 
 Ints = NDArray[np.int32]
-Mask = NDArray[np.bool_]
 
 TRAVEL, AS_SLICED = -2, -3
 """Classes beside the features, whose ids begin at -1 (unnamed)."""
@@ -82,7 +82,6 @@ def move_classes(moves: Moves, first_layer: FirstLayer = FirstLayer()) -> Ints:
 
     Parameters
     ----------
-    moves : Moves
     first_layer : FirstLayer
         Its moves stay as they are.
 
@@ -107,12 +106,10 @@ def paced(piece: Piece, classes: Ints, paces: Mapping[int, Pace], machine: Machi
 
     Parameters
     ----------
-    piece : Piece
     classes : ndarray of int32, shape (moves of the piece,)
         As `move_classes` gives them.
     paces : mapping
         Class to pace; classes not listed keep theirs.
-    machine : Machine
 
     Returns
     -------

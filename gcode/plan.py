@@ -19,10 +19,8 @@ def plan_moves(
 
     Parameters
     ----------
-    moves : Moves
     limits : sequence of Limits
         The table of `Moves.limits_id`.
-    machine : Machine
     rests_apart : bool
         See `FirmwareAdapter.planner`.
 

@@ -145,7 +145,6 @@ def distances(
         At least one, in order of time.
     points_mm : ndarray, shape (2 or more, n)
         x y first; of the times ``k dt``, but for what follows.
-    dt_s : float
     first : ndarray of int64, shape (stretches,)
         Point that each stretch begins with, rising from 0.
     late_s, until_s : ndarray, shape (stretches,)
@@ -159,13 +158,7 @@ def distances(
 
 
 class Sampler:
-    """Sample a stream of phases on the grid ``t = k dt``, k = 0, 1, ...
-
-    Parameters
-    ----------
-    dt_s : float
-        Step.
-    """
+    """Sample a stream of phases on the grid ``t = k dt``, k = 0, 1, ..."""
 
     def __init__(self, dt_s: float) -> None:
         if not (dt_s > 0 and math.isfinite(dt_s)):

@@ -54,7 +54,6 @@ class Splitter:
 
     Parameters
     ----------
-    machine : Machine
     longest_s : float
         No piece lasts longer.
     compensate : bool

@@ -42,7 +42,6 @@ class Timeline:
 
     Attributes
     ----------
-    dt_s : float
     position_mm : ndarray, shape (4, n)
         x y z e at the times ``k * dt_s``.
     row : ndarray of int64, shape (n,)
@@ -51,7 +50,6 @@ class Timeline:
         X or Y moves at the sample.
     rests : ndarray of int64, shape (k, 2)
         Ranges [a, b) of samples in which u(i) = u(i - 1) must hold; the path stands at a - 1.
-    groups : list of Group
     start_s, end_s : ndarray, shape (len(groups),)
         When each group starts and ends, standing time before and after a stretch included, in which
         a command may move already; a stretch is padded to the grid at its end.
@@ -118,8 +116,6 @@ def build_timeline(
         As `group_rows` gives them.
     rest_s : ndarray, shape (len(groups),)
         Duration of each rest under the limits of the written file (ignored for stretches).
-    dt_s : float
-        Sampling time.
     lead_s, tail_s : float
         Standing time before and after every stretch, for compensators that need it.
     """

@@ -8,11 +8,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array
 from stillpath.models.jit import kernel
 
 __all__ = ["advance"]
 
-Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 _TINY = 1e-150
 _FLUSH = 255

@@ -15,12 +15,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from stillpath.models.arrays import Array, Complex
 from stillpath.models.errors import ModelError
 
 __all__ = ["Block", "Diagram", "Running", "polynomial_response"]
 
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 Coefficients = tuple[float, ...]
 
 

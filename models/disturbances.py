@@ -9,9 +9,9 @@ import math
 from typing import Annotated, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
+from stillpath.models.arrays import Array
 from stillpath.models.document import Document, Finite, NonNegative, Positive
 from stillpath.models.errors import ModelError
 
@@ -26,8 +26,6 @@ __all__ = [
     "Wideband",
     "sample",
 ]
-
-Array = NDArray[np.float64]
 
 
 class SensorSpec(Document):

@@ -15,13 +15,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillpath.models._friction_kernels import bent, received
+from stillpath.models.arrays import Array
 
 __all__ = ["BEND_MM", "DryFriction", "bend_of"]
-
-Array = NDArray[np.float64]
 
 BEND_MM = 0.01
 """Travel over which friction reverses: 5 to 20 um on rolling and sliding guides. Half or twice as

@@ -159,7 +159,6 @@ def kernel(
     *,
     inline: bool = False,
     force_inline: bool = False,
-    parallel: bool = False,
     allocates: bool = True,
 ) -> Callable[[Callable[P, R]], Callable[P, R]]: ...
 
@@ -170,7 +169,6 @@ def kernel(
     *,
     inline: bool = False,
     force_inline: bool = False,
-    parallel: bool = False,
     allocates: bool = True,
 ) -> Any:
     """Compile a function of numbers and arrays with numba.
@@ -185,8 +183,6 @@ def kernel(
     force_inline : bool
         Inline the machine code into callers whatever its length: a call forces the caller to spill
         its registers.
-    parallel : bool
-        Allow `numba.prange`.
     allocates : bool
         False: it neither creates nor returns arrays, so reference counting is left out, which costs
         more than the work of a small kernel with many array arguments.
@@ -196,7 +192,6 @@ def kernel(
         decorate: Any = numba.njit(  # type: ignore[call-overload]  # its stubs lack _nrt
             nogil=True,
             fastmath=False,
-            parallel=parallel,
             _nrt=allocates,
             inline="always" if inline else "never",
             forceinline=force_inline,

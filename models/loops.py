@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, ValidationError
 
+from stillpath.models.arrays import Complex
 from stillpath.models.diagrams import Block, polynomial_response
 from stillpath.models.disturbances import SensorSpec
 from stillpath.models.document import Document, Finite, Positive
@@ -39,7 +40,6 @@ __all__ = [
 ]
 
 Coefficients = tuple[float, ...]
-Complex = NDArray[np.complex128]
 Polynomial = Annotated[tuple[Finite, ...], Field(min_length=1, max_length=64)]
 _LIBRARY = Path(__file__).parent / "library_loops"
 
@@ -52,13 +52,10 @@ class Loop:
     ----------
     plant_num, plant_den : tuple of float
         P, strictly proper.
-    dt_s : float
-        Sampling time.
     error_num, error_den : tuple of float
         C_e, on the control error. 0: the output is not fed back, v = r.
     rate_num, rate_den : tuple of float
         C_y, on the measured output alone (velocity feedback).
-    name : str
     notes : tuple of str
         What was changed on reading.
     """

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array
 from stillpath.models.plants import DiscretePlant
 
 __all__ = ["modal_form"]
-
-Array = NDArray[np.float64]
 
 _LARGEST_CONDITION = 1e9
 

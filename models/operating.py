@@ -13,8 +13,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array
 from stillpath.models.machine import Machine
 from stillpath.models.schedule import (
     Coordinate,
@@ -25,8 +25,6 @@ from stillpath.models.schedule import (
 )
 
 __all__ = ["OperatingGrid", "machine_at", "mass_schedules"]
-
-Array = NDArray[np.float64]
 
 
 def machine_at(machine: Machine, point: OperatingPoint) -> Machine:
@@ -53,7 +51,6 @@ class OperatingGrid:
 
     Parameters
     ----------
-    machine : Machine
     step : float
         Largest ratio of a resonance from one mass or height to the next, minus 1.
     blend_step : float

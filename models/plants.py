@@ -70,7 +70,6 @@ class _StateSpace:
     Attributes
     ----------
     a, b, c : ndarray, shapes (n, n), (n,), (n,)
-    d : float
     notes : tuple of str
         What was changed on reading the model.
     """

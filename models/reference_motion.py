@@ -11,11 +11,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array
 from stillpath.models.machine import Machine
 
 __all__ = ["reference_limits", "reference_motion", "reference_motion_of"]
-
-Array = NDArray[np.float64]
 
 _CORNER_MM_S = 5.0
 _TRAVEL_MM_S, _TRAVEL_MM_S2 = 200.0, 5000.0
@@ -58,7 +57,6 @@ def reference_motion(
 
     Parameters
     ----------
-    dt_s : float
     fastest_mm_s, largest_accel_mm_s2 : float
         Limits of speed and acceleration; from 250 mm/s and 5000 mm/s2 they change nothing.
     """

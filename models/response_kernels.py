@@ -6,13 +6,12 @@ They are in this layer because compensators simulate their plants too.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array
 from stillpath.models.jit import kernel
 
 __all__ = ["block_states", "dense_response", "in_blocks", "modal_response"]
 
-Array = NDArray[np.float64]
 _CHUNK, _CHUNK_BLOCKS = 1024, 64
 _TINY = 1e-150
 

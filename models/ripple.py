@@ -25,9 +25,10 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import Field, model_validator
 
+from stillpath.models.arrays import Array, Complex
 from stillpath.models.document import Document, Finite, NonNegative
 from stillpath.models.errors import ModelError
 
@@ -41,8 +42,6 @@ __all__ = [
     "RippleTable",
 ]
 
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 RippleSide = Literal["input", "output"]
 RippleAxis = Literal["x", "y", "a", "b"]
 """X and Y, and the motors of CoreXY: a (x + y) and b (x - y)."""

@@ -256,8 +256,6 @@ def moving_mass_from_two_runs(
     ----------
     f0_hz, f1_hz : float
         Frequency of the bed's mode with the bed empty, and with the weight at its centre.
-    added_kg : float
-        The weight.
     f0_sd_hz, f1_sd_hz : float
         Standard deviations; that of the result is propagated to first order.
 

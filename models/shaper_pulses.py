@@ -6,13 +6,12 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
 
 __all__ = ["SHAPERS", "Pulses", "shaper_pulses"]
 
-Array = NDArray[np.float64]
 Pulses = tuple[Array, Array]
 """Weights and delays [s]."""
 

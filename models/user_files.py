@@ -14,7 +14,6 @@ def read_bytes(path: Path, largest: int, otherwise: str) -> bytes:
 
     Parameters
     ----------
-    path : Path
     largest : int
         Most bytes that are read.
     otherwise : str

@@ -7,11 +7,11 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array
 from stillpath.models.machine import Machine
 
 __all__ = ["BandContent"]
 
-Array = NDArray[np.float64]
 T = TypeVar("T", bound=np.generic)
 
 BLOCK = 1024
@@ -30,11 +30,6 @@ class BandContent:
     Blocks of 1024 samples (Welch 1967, Hann window, no overlap) of the planned acceleration, as
     slow travel would leak from a spectrum of positions; |Y(f)| = |A(f)| / (2 sin(pi f dt) / dt)^2,
     since the acceleration is a second difference.
-
-    Parameters
-    ----------
-    machine : Machine
-    dt_s : float
     """
 
     def __init__(self, machine: Machine, dt_s: float) -> None:

@@ -23,6 +23,7 @@ from stillpath.compensation.defaults import DEFAULT_BASIS
 from stillpath.compensation.fbf import PreviewFbf
 from stillpath.compensation.friction import against_friction
 from stillpath.compensation.shapers import ShaperCompensator
+from stillpath.models.arrays import Array
 from stillpath.models.machine import CommandLimits, Machine
 from stillpath.models.plants import DiscretePlant, PlantSetSpec, plant_set
 from stillpath.models.reference_motion import reference_motion_of
@@ -56,7 +57,6 @@ __all__ = [
     "stated_note",
 ]
 
-Array = NDArray[np.float64]
 T = TypeVar("T")
 Pair: TypeAlias = tuple[DiscretePlant, DiscretePlant]
 Shares: TypeAlias = tuple[float, float]
@@ -216,7 +216,6 @@ def choose_caution(
 
     Parameters
     ----------
-    machine : Machine
     shaper : BestShaper
         Tuned for the nominal plants.
     directory : Path

@@ -61,7 +61,6 @@ def csv_table(target: Path, formats: Mapping[str, str]) -> Iterator[Table]:
 
     Parameters
     ----------
-    target : Path
     formats : mapping
         Names of the columns and how a value is written, as ``%.3f``.
     """

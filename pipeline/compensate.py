@@ -47,8 +47,6 @@ def compensate_file(
         Plain or binary G-code or a 3MF package; the target is of the same kind, or plain if its
         name says so and the source's does not; with method `live` it is a copy. It is renamed when
         it is complete; the source is only read. They may be the same file.
-    machine : Machine
-    options : Options
     cache_dir : Path, optional
         Where the tuned shaper of a machine revision is kept.
     progress : callable, optional

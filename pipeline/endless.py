@@ -25,9 +25,6 @@ class LengthGuard:
     ----------
     text : binary file
         The print; its position is preserved.
-    machine : Machine
-    dialect : Dialect
-        Dialect of the file.
     """
 
     def __init__(self, text: BinaryIO, machine: Machine, dialect: Dialect) -> None:

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array
 from stillpath.models.friction import DryFriction
 from stillpath.models.machine import Machine
 from stillpath.models.plant_specs import PlantSetSpec
@@ -31,7 +31,6 @@ __all__ = [
     "unseen_friction_mm",
 ]
 
-Array = NDArray[np.float64]
 Pair: TypeAlias = tuple[DiscretePlant, DiscretePlant]
 
 _FRICTION_UNSURE = 0.35

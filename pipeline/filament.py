@@ -7,12 +7,11 @@ from numpy.typing import NDArray
 
 from stillpath.gcode.timeline import Timeline
 from stillpath.gcode.types import Phases
+from stillpath.models.arrays import Array
 from stillpath.models.runs import runs
 from stillpath.pipeline._filament_kernels import smooth_along
 
 __all__ = ["feed_evenly", "retract_along"]
-
-Array = NDArray[np.float64]
 
 _FEED_REACH, _FEED_REACH_MM = 2.5, 0.5
 """Half-width of the smoothing of filament along the path: a multiple of the filament per mm of

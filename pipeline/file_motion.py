@@ -78,9 +78,6 @@ class TextMotion:
     ----------
     file : binary file
         Plain G-code, seekable; read from its beginning.
-    machine : Machine
-    dialect : Dialect
-    dt_s : float
     longest_stand_s : float
         Longer standstills are cut to this.
     shaping : Shaping

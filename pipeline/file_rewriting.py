@@ -30,7 +30,6 @@ class FileRewriting:
         Receives the new G-code.
     spool : binary file
         Seekable; holds the new G-code until its times are known.
-    layers : LayerWriter, optional
     sizes : dict
         File size fields of a `Result`; filled when the new file is complete.
     """

@@ -95,8 +95,6 @@ class Job:
     ----------
     source, target : binary files
         Plain G-code, seekable; the target is read again at the end.
-    order : Order
-    layers : LayerWriter, optional
     trace : callable, optional
         Is given the motion as it is measured.
     budget : SpeedBudget, optional

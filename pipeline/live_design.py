@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.live_filter import LiveFilter, design_taps, exact_moments, shaper_taps
+from stillpath.models.arrays import Array
 from stillpath.models.machine import Machine
 from stillpath.models.plants import plant_set
 from stillpath.models.reference_motion import reference_motion_of
@@ -35,8 +35,6 @@ from stillpath.pipeline.measuring.reference_shaper import BestShaper, cached_sha
 from stillpath.pipeline.result import Channel
 
 __all__ = ["LiveDesign", "cached_live_design", "design_live", "live_filter"]
-
-Array = NDArray[np.float64]
 
 DT_S = 1e-3
 _VERSION = 5
@@ -59,9 +57,6 @@ class LiveDesign:
     taps : ndarray, shape (2, n)
     shares : (float, float)
         Share of the filter in the taps of X and Y; the rest is the shaper.
-    corner_hz : float
-        Bandwidth of the filter.
-    shaper : BestShaper
     worst, mean : float
         Largest and geometric mean over the members of the contour error against the shaper's.
     ranges : dict of str to ErrorRange

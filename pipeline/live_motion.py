@@ -7,26 +7,19 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.live_filter import LiveFilter
+from stillpath.models.arrays import Array
 from stillpath.models.schedule import OperatingPoint
 from stillpath.models.shaping import OFF, Shaping
 from stillpath.pipeline.measuring.points import MotionSamples, part_of
 
 __all__ = ["LiveMotion"]
 
-Array = NDArray[np.float64]
-
 
 class LiveMotion:
-    """The motion of a file through a look-ahead filter, rests included.
-
-    Parameters
-    ----------
-    live : LiveFilter
-    """
+    """The motion of a file through a look-ahead filter, rests included."""
 
     def __init__(self, live: LiveFilter) -> None:
         self._live = live

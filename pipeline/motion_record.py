@@ -30,8 +30,6 @@ class MotionRecord:
     ----------
     step_mm : (float, float, float, float)
         Steps of X Y Z E that the firmware rounds to; 0: it does not.
-    measurement : Measurement
-    totals : Totals
     changing : (Compensator, Verifier), optional
         They follow all motion of the machine; None: the file is not changed.
     """

@@ -23,10 +23,6 @@ firmware may load by itself. Such a retraction is not offset against later extru
 class Operation:
     """Follow the moves of a file, item by item.
 
-    Parameters
-    ----------
-    machine : Machine
-
     Attributes
     ----------
     printed_kg : float

@@ -24,8 +24,6 @@ class FileParts:
     Parameters
     ----------
     source : binary file
-    reader : Interpreter
-    splitter : Splitter
     clock : StageClock
         Times reading and planning.
     """
@@ -55,7 +53,6 @@ def refuse_processed(block: ProgramBlock, do: str = "compensate") -> None:
 
     Parameters
     ----------
-    block : ProgramBlock
     do : str
         What the message tells the user to do with the original.
     """

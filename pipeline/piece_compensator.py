@@ -74,12 +74,9 @@ class CompensatedPiece:
 
     Attributes
     ----------
-    timeline : Timeline
     command_mm : ndarray, shape (4, n)
         x y as commanded, z e as planned, on the timeline's grid.
     extruding : ndarray of bool, shape (n,)
-    segments : Segments
-    encoded : Encoded
     step_mm, bend_mm : float
         Longest step of the command in XY, and largest second difference of either axis.
     """
@@ -98,8 +95,6 @@ class PieceCompensator:
 
     Parameters
     ----------
-    machine : Machine
-    options : Options
     shaper : BestShaper, optional
         The tuned frequencies, for `shaper:NAME` of the same type.
     caution : Caution, optional
@@ -134,7 +129,6 @@ class PieceCompensator:
 
         Parameters
         ----------
-        piece : Piece
         point : OperatingPoint
             Operating point; only matters with schedules.
 
@@ -389,10 +383,8 @@ def as_executed(
 
     Parameters
     ----------
-    piece : CompensatedPiece
     phases : Phases
         The intended motion (`gcode.firmware.planning.intended`).
-    executed : Phases
 
     Returns
     -------

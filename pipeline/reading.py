@@ -28,7 +28,6 @@ def dialect_for(machine: Machine, name: DialectName | None = None) -> Dialect:
 
     Parameters
     ----------
-    machine : Machine
     name : str, optional
         A dialect that the machine's firmware reads; None: its own.
 

@@ -56,7 +56,6 @@ class Selection:
     where : {"all", "visible", "walls"}
         `walls`: outer, overhanging and thin walls. `visible`: those, and surfaces at the top and
         at the bottom.
-    machine : Machine
     """
 
     def __init__(self, where: Where, machine: Machine) -> None:

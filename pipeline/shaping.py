@@ -12,15 +12,13 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array
 from stillpath.models.schedule import OperatingPoint
 from stillpath.models.shaping import OFF, AxisShaper, Shaping
 from stillpath.pipeline.measuring.points import MotionSamples, part_of
 
 __all__ = ["ShapedMotion", "shaped"]
-
-Array = NDArray[np.float64]
 
 _REACH_S = 0.2
 """Largest delay or advance of a shaper: 3hump_ei at 10 Hz."""
@@ -30,10 +28,6 @@ class ShapedMotion:
     """Motion that arrives in blocks, with the firmware's command for it.
 
     Shapers are centred, like Klipper's: a constant delay is not a path error.
-
-    Parameters
-    ----------
-    dt_s : float
     """
 
     def __init__(self, dt_s: float) -> None:

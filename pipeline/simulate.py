@@ -69,9 +69,6 @@ def plan_file(
     target_npz : Path
         Arrays ``t`` [s, 0 at the first move], ``x y z`` [mm, machine axes] and ``e`` [mm, the
         firmware's cumulative extruder position], written whole or not at all.
-    machine : Machine
-    rate_hz : float
-        Samples per second.
     plate : int, optional
         Which plate of a 3MF package with several.
     dialect : str, optional

@@ -43,8 +43,6 @@ def write_trajectories(
 
     Parameters
     ----------
-    source : Path
-        The sliced file.
     target : Path
         Written atomically. Columns: ``t_s``; ``x_mm y_mm z_mm``, the motion that the
         firmware makes of the sliced file; ``after_x_mm after_y_mm``, that of the written file;

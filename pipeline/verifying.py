@@ -31,13 +31,7 @@ _CLEARLY = 1.1
 
 
 class Verifier:
-    """Checks compensated pieces by their read-back motion.
-
-    Parameters
-    ----------
-    machine : Machine
-    tolerance_um : float
-    """
+    """Checks compensated pieces by their read-back motion."""
 
     def __init__(self, machine: Machine, tolerance_um: float) -> None:
         firmware = adapter(machine)
@@ -58,12 +52,8 @@ class Verifier:
 
         Parameters
         ----------
-        piece : Piece
-            The piece as sliced.
-        made : CompensatedPiece
         gap_mm : ndarray
             Distance from the command (`pipeline.piece_compensator.deviation`).
-        executed : Phases
 
         Raises
         ------
@@ -108,8 +98,6 @@ class Verifier:
         ----------
         motion : MotionSamples
             Without `sliced_mm` (the firmware does not round to steps) nothing is done.
-        point : OperatingPoint
-            Operating point.
 
         Raises
         ------

@@ -42,8 +42,6 @@ def live_way(channel: Channel, time_s: float, size: int) -> PrintWay:
 
     Parameters
     ----------
-    channel : Channel
-        Predicted figures.
     time_s : float
         Print time as sliced.
     size : int

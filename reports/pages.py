@@ -61,8 +61,6 @@ def rendered(
         Where the Jinja template lies.
     style : str
         CSS; the template finds it as `style` and its hash as `style_hash`.
-    filters : mapping
-        Filters of the template.
     **values
         Names of the template; a missing one is an error.
     """

@@ -34,7 +34,6 @@ def write_report(result: Result, directory: Path) -> None:
 
     Parameters
     ----------
-    result : Result
     directory : Path
         Made if it does not exist.
 

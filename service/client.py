@@ -61,8 +61,6 @@ class Client:
     ----------
     server : str
         As in a browser: ``http://127.0.0.1:8000``.
-    key : str, optional
-        An API key.
     patience_s : float
         For how long a service that does not answer, or is busy, is asked again.
 
@@ -103,7 +101,6 @@ class Client:
         source : Path
         machine : str
             As the service calls it.
-        options : Options, optional
         name : str, optional
             What the file is called in the report; by default its own name.
         tell : callable, optional
@@ -168,7 +165,6 @@ class Client:
 
         Parameters
         ----------
-        job_id : str
         tell : callable, optional
             Is told of every change; may raise to stop the waiting.
         timeout_s : float, optional

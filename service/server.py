@@ -41,7 +41,6 @@ def serve_forever(
 
     Parameters
     ----------
-    settings : Settings
     host : str
         Address to bind.
     port : int

@@ -19,7 +19,6 @@ def wrong_option(error: ValidationError, called: Mapping[str, str] | None = None
 
     Parameters
     ----------
-    error : ValidationError
     called : mapping, optional
         Field to option, where one is not called like the other.
     """

@@ -7,6 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array
 from stillpath.models.jit import kernel
 
 __all__ = [
@@ -17,8 +18,6 @@ __all__ = [
     "motion_sums",
     "path_tables",
 ]
-
-Array = NDArray[np.float64]
 
 BOX = 16
 """Segments of the path that share a box."""

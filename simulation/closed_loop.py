@@ -10,15 +10,14 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stillpath.models.arrays import Array
 from stillpath.models.diagrams import Block, Diagram, Running
 from stillpath.models.disturbances import SensorSpec
 from stillpath.models.loops import Loop
 
 __all__ = ["ClosedLoop", "Imperfections", "batch", "simulate"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

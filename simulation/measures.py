@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array, Mask
 from stillpath.simulation._contour_kernels import (
     BOX,
     contour_distances,
@@ -33,9 +34,7 @@ __all__ = [
     "tracking_error",
 ]
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
-Mask = NDArray[np.bool_]
 
 WINDOW_S = 0.08
 """Time before and after a sample in which the nearest point of the path is searched."""
@@ -123,7 +122,6 @@ class ContourErrors:
 
     Attributes
     ----------
-    first, stride : int
     error_mm : ndarray, shape (channels, m)
     """
 
@@ -146,8 +144,6 @@ class ContourMeter:
 
     Parameters
     ----------
-    dt_s : float
-        Sampling time.
     window_s : float
         Time before and after a point in which the path counts; less at start and end.
     stride : int

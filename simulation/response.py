@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array
 from stillpath.models.modal import modal_form
 from stillpath.models.plants import DiscretePlant
 from stillpath.models.response_kernels import (
@@ -18,8 +18,6 @@ from stillpath.models.response_kernels import (
 )
 
 __all__ = ["PlantStream", "response"]
-
-Array = NDArray[np.float64]
 
 
 _BLOCK, _LEAST_BLOCKS = 16, 4

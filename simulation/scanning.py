@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["TrackErrors", "track_errors"]
+from stillpath.models.arrays import Array
 
-Array = NDArray[np.float64]
+__all__ = ["TrackErrors", "track_errors"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

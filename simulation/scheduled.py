@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array
 from stillpath.models.friction import DryFriction
 from stillpath.models.machine import Machine
 from stillpath.models.operating import OperatingGrid, machine_at
@@ -14,8 +14,6 @@ from stillpath.models.schedule import EMPTY, OperatingPoint
 from stillpath.simulation.response import PlantStream
 
 __all__ = ["BLEND_STEP", "REMEMBERED_S", "SIMULATION_STEP", "MachineStream"]
-
-Array = NDArray[np.float64]
 
 SIMULATION_STEP = 0.001
 """Ratio, minus 1, by which a resonance moves in mass or height before the plants are taken anew."""
@@ -34,8 +32,6 @@ class MachineStream:
 
     Parameters
     ----------
-    machine : Machine
-    dt_s : float
     point : OperatingPoint
         Where the machine is at first; without schedules it does not matter.
     member : int, optional

@@ -36,13 +36,12 @@ from stillpath.compensation.feedback.inverse_dob import inverse_dob
 from stillpath.compensation.feedback.mmp import mmp
 from stillpath.compensation.feedback.multirate import design_multirate
 from stillpath.compensation.feedback.repetitive import design_quasi, design_wide_band, shared_period
+from stillpath.models.arrays import Array
 from stillpath.models.disturbances import SensorSpec
 from stillpath.models.loops import Loop, LoopSpec, builtin_loops, load_loop
 from stillpath.version import __version__
 
 __all__ = ["Designed", "design_controller", "fitting_methods", "loop_figures"]
-
-Array = NDArray[np.float64]
 
 _LARGEST_WORK = 1.2e9
 """Limit on states cubed times plants: about ten seconds of eigenvalues."""

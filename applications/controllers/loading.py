@@ -31,12 +31,8 @@ class LoadedController:
 
     Attributes
     ----------
-    method : str
     spec : LoopSpec
         The machine it was designed for.
-    options : ControllerOptions
-        Options of the design.
-    blocks : tuple of Block
     every : int
         Block samples per sample of the machine's loop.
     settling : int

@@ -26,19 +26,7 @@ _LOWEST_DB, _HIGHEST_DB = -60.0, 40.0
 
 
 def write_controller(made: Designed, directory: Path) -> None:
-    """Write controller.html, controller.json and controller.h, each whole or not at all.
-
-    Parameters
-    ----------
-    made : Designed
-    directory : Path
-        Made if it does not exist.
-
-    Raises
-    ------
-    OSError
-        If the folder or a file cannot be written.
-    """
+    """Write controller.html, controller.json and controller.h by `reports.pages.write_texts`."""
     texts = {
         "controller.json": made.report.model_dump_json(),
         "controller.h": made.controller.to_c_header(),

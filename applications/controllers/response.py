@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillpath.applications.controllers.figures import (
     Envelope,
@@ -29,6 +28,7 @@ from stillpath.compensation.base import DesignError
 from stillpath.compensation.feedback.adaptive import AdaptiveFmsdob
 from stillpath.compensation.feedback.controller import Controller
 from stillpath.compensation.feedback.fmsdob import fmsdob
+from stillpath.models.arrays import Array
 from stillpath.models.diagrams import Block
 from stillpath.models.disturbances import (
     DisturbanceSpec,
@@ -52,8 +52,6 @@ __all__ = [
     "settling_ticks",
     "time_figures",
 ]
-
-Array = NDArray[np.float64]
 
 _LEAST_SAMPLES, _MOST_SAMPLES = 2000, 200_000
 _MOST_TICKS = 3e7

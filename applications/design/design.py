@@ -45,6 +45,7 @@ from stillpath.compensation.metrics import (
 from stillpath.compensation.nominal import two_step
 from stillpath.compensation.preview_axis import Designs, designs, functions_within
 from stillpath.compensation.shapers import SHAPERS
+from stillpath.models.arrays import Array
 from stillpath.models.machine import Machine
 from stillpath.models.plants import DiscretePlant, PlantSet, plant_set
 from stillpath.pipeline.caution import design_mode
@@ -52,8 +53,6 @@ from stillpath.pipeline.measuring.reference_shaper import BestShaper, tune_each
 from stillpath.version import __version__
 
 __all__ = ["AXES", "ERRORS_PERCENT", "design_report"]
-
-Array = NDArray[np.float64]
 
 AXES = ("x", "y")
 ERRORS_PERCENT = tuple(range(-20, 21, 2))
@@ -78,7 +77,6 @@ def design_report(
 
     Parameters
     ----------
-    machine : Machine
     axis : {"x", "y"}
     basis, robust : str
         As of `compensation.fbf.PreviewFbf`; ``auto`` is the mode of jobs, without a shaper's share.
@@ -131,8 +129,6 @@ class _Designed:
 
     Attributes
     ----------
-    row : int
-        Row of the axis.
     by_mode : dict of str to PreviewFbf
         For every robust mode that can be designed.
     missing : list of str

@@ -41,19 +41,7 @@ _STYLES = {
 
 
 def write_design(report: DesignReport, directory: Path) -> None:
-    """Write design.html and design.json into a folder, each whole or not at all.
-
-    Parameters
-    ----------
-    report : DesignReport
-    directory : Path
-        Made if it does not exist.
-
-    Raises
-    ------
-    OSError
-        If the folder or a file cannot be written.
-    """
+    """Write design.html and design.json into a folder by `reports.pages.write_texts`."""
     page = render_design(report)
     write_texts(directory, {"design.json": report.model_dump_json(), "design.html": page})
 
@@ -167,7 +155,6 @@ def _figure(
     note: str,
     y_title: str,
     *lines: Line,
-    log: bool = True,
 ) -> _Figure:
     """Return a figure over the number of functions n, with the chosen one marked."""
 
@@ -181,7 +168,7 @@ def _figure(
         y_title=y_title,
         lines=lines,
         tick=tick,
-        log=log,
+        log=True,
         marks=[Mark(summary.rung.n, f"n {summary.rung.n} taken")] if summary.rung else [],
     )
     columns = [f"{y_title.split(',')[0]} {line.name}".strip() for line in lines]

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from stillpath.applications.design.figures import Curve
 from stillpath.compensation.fbf import PreviewFbf
 from stillpath.compensation.shapers import shape_xy
+from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
 from stillpath.models.plants import DiscretePlant, PlantSpec, WeightedMember, discretise, plant_set
@@ -23,8 +24,6 @@ from stillpath.simulation.measures import Tally, contour_error
 from stillpath.simulation.response import response
 
 __all__ = ["STAND_S", "Trial"]
-
-Array = NDArray[np.float64]
 
 STAND_S = 0.12
 """Standstill before and after the motion: centred shapers begin early and end late."""
@@ -37,10 +36,8 @@ class Trial:
 
     Parameters
     ----------
-    machine : Machine
     axis : str
         The axis in doubt, x or y.
-    dt_s : float
     motion : (path, extruding), optional
         Shapes (2, n) in mm and (n,), at rest at both ends; default: the reference motion.
     errors_percent : sequence of float
@@ -97,7 +94,6 @@ class Trial:
 
         Parameters
         ----------
-        fbf : PreviewFbf
         mode : str
             Its setting of `robust`.
         rungs : sequence of str
@@ -123,7 +119,6 @@ class Trial:
         Parameters
         ----------
         command_mm : ndarray, shape (2, samples of `y_d_mm`)
-        plant : DiscretePlant
         """
         other = response([self._other], command_mm[[1 - self._row]])[0]
         return self._rms(command_mm, plant, other)

@@ -11,7 +11,7 @@ from pathlib import Path
 from stillpath.applications.identification.figures import AxisFigures, IdentificationReport
 from stillpath.models.provenance import MeasuredMode
 from stillpath.reports.charts import Chart, Figure, Line, Mark, captioned
-from stillpath.reports.pages import rendered, style_of, write_texts
+from stillpath.reports.pages import rendered, style_of, thousands, write_texts
 
 __all__ = [
     "change_text",
@@ -30,19 +30,7 @@ _OF_KLIPPER = re.compile(r"^(?:resonances|calibration_data|raw_data)_(.*)\.csv.*
 
 
 def write_identification(report: IdentificationReport, directory: Path) -> None:
-    """Write identification.html and identification.json into a folder, each whole or not at all.
-
-    Parameters
-    ----------
-    report : IdentificationReport
-    directory : Path
-        Made if it does not exist.
-
-    Raises
-    ------
-    OSError
-        If the folder or a file cannot be written.
-    """
+    """Write identification.html and identification.json by `reports.pages.write_texts`."""
     page = render_identification(report)
     texts = {"identification.json": report.model_dump_json(), "identification.html": page}
     write_texts(directory, texts)
@@ -54,7 +42,7 @@ def render_identification(report: IdentificationReport) -> str:
         _PACKAGE,
         "identification.html.j2",
         style_of((_PACKAGE, "identification.css")),
-        {"number": _number, "fit": fit_text, "interval": interval_text, "change": change_text},
+        {"number": thousands, "fit": fit_text, "interval": interval_text, "change": change_text},
         d=report,
         axes=[_Axis(axis, _figures(axis)) for axis in report.axes],
     )
@@ -163,11 +151,6 @@ def _apart(modes: Sequence[MeasuredMode]) -> list[MeasuredMode]:
         if mode.zeta < 0.4 and all(abs(mode.f_hz - other.f_hz) > 25.0 for other in out):
             out.append(mode)
     return sorted(out, key=lambda m: m.f_hz)
-
-
-def _number(value: float) -> str:
-    # A thin no-break space between thousands, as SI writes them.
-    return f"{value:,.0f}".replace(",", "\u202f")
 
 
 def fit_text(axis: AxisFigures) -> str:

@@ -17,6 +17,7 @@ from stillpath.applications.identification.figures import (
     SpectrumFigures,
     TrialFigures,
 )
+from stillpath.models.arrays import Array
 from stillpath.models.identification.prediction import predicted_psd, predicted_spectrum
 from stillpath.models.identification.readers import ReadSettings, direction_of, excitation_for
 from stillpath.models.identification.sets import measured_modes
@@ -35,8 +36,6 @@ from stillpath.models.provenance import MeasuredMode, SourceFile
 from stillpath.version import __version__
 
 __all__ = ["identification_report"]
-
-Array = NDArray[np.float64]
 
 _POINTS = 240
 _MOST_POINTS = 500
@@ -63,7 +62,6 @@ def identification_report(
         Axis to what was identified.
     settings : ReadSettings
         Settings with which the measurements were read.
-    sources : sequence of SourceFile
     """
     return IdentificationReport(
         version=__version__,

@@ -40,8 +40,6 @@ class InputFile:
     ----------
     name : str
         Without folder; tells axis and date.
-    condition : Condition
-        Conditions of the measurement.
     """
 
     name: str
@@ -87,10 +85,8 @@ def identify_files(
 
     Parameters
     ----------
-    files : sequence of InputFile
     base : Machine
         Source of everything that was not measured.
-    settings : ReadSettings, optional
     name, title : str, optional
         Of the machine, if it is a new one.
     max_order : int

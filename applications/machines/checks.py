@@ -72,8 +72,6 @@ def check_before_job(
 
     Parameters
     ----------
-    machine : Machine
-    now : datetime
     max_age_days : float
         Largest age of a measurement.
     config : PrinterConfig, optional
@@ -146,7 +144,6 @@ class StatedMachine:
 
     Attributes
     ----------
-    name : str
     title : str
         Empty: the name.
     f_hz : (float, float)
@@ -169,7 +166,6 @@ def machine_from_config(config: PrinterConfig, stated: StatedMachine) -> Machine
 
     Parameters
     ----------
-    config : PrinterConfig
     stated : StatedMachine
         Without resonances the input shaper's frequencies are used, else 50 Hz.
 

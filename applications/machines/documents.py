@@ -41,7 +41,6 @@ class Documents(Protocol):
 
         Parameters
         ----------
-        path, text : str
         beside : str, optional
             Another document that must exist.
 

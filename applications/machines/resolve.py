@@ -73,7 +73,6 @@ class Resolver:
 
     Parameters
     ----------
-    store : MachineStore
     require_approval : bool
         Jobs use approved revisions only. Built-in machines count as approved.
     max_age_days : float

@@ -144,8 +144,6 @@ class MachineStore:
         ----------
         name : str
             Also the document's own name; not a built-in machine's.
-        author, message : str
-            Who and why.
         sources : sequence of SourceFile
             Files the change was made from.
         when : datetime, optional

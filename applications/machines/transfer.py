@@ -96,7 +96,6 @@ def with_firmware_file(machine: Machine, file: Path) -> tuple[Machine, SourceFil
 
     Parameters
     ----------
-    machine : Machine
     file : Path
         A section as JSON, or what Marlin answers to M503: then what that does not say stays.
 

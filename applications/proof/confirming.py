@@ -12,7 +12,6 @@ from datetime import date
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillpath.applications.proof.drive import ringing_mode
 from stillpath.applications.proof.judging import AxisMotion, judge
@@ -38,6 +37,7 @@ from stillpath.applications.proof.ring_motion import (
     read_ring_motion,
 )
 from stillpath.applications.proof.ring_test import AXES, Axis
+from stillpath.models.arrays import Array
 from stillpath.models.confirmation import Confirmation, plants_digest, um_text
 from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
@@ -46,8 +46,6 @@ from stillpath.models.provenance import SourceFile
 from stillpath.version import __version__
 
 __all__ = ["verify_ring"]
-
-Array = NDArray[np.float64]
 
 _RINGS = 0.3
 """Damping ratio above which nothing rings after a stop."""
@@ -83,7 +81,6 @@ def verify_ring(
         The ring test as it was written.
     logs : sequence of Path
         Klipper's or RepRapFirmware's raw accelerations; each may hold one axis or both.
-    machine : Machine
     today : date, optional
         Of the confirmation.
 

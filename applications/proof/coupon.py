@@ -69,10 +69,8 @@ def write_coupon(
 
     Parameters
     ----------
-    machine : Machine
     target : Path
         Written whole or not at all.
-    settings : PrintSettings, optional
     cache_dir, progress
         As of `pipeline.compensate.compensate_file`.
 

@@ -48,8 +48,6 @@ class Halves:
 
     Parameters
     ----------
-    machine : Machine
-    settings : PrintSettings
     width_mm, depth_mm : float
         Of a half.
     what : str
@@ -148,7 +146,6 @@ class ProofPrint:
         By region.
     legend : list of str
         First comments of the file.
-    warnings : list of str
     """
 
     result: Result

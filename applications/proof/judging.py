@@ -19,11 +19,11 @@ from scipy.signal.windows import tukey
 from stillpath.applications.proof.drive import RingingMode, ringing_mode
 from stillpath.applications.proof.figures import AxisReadback, Corners, Curve
 from stillpath.applications.proof.matching import band_pass
+from stillpath.models.arrays import Array
 from stillpath.models.plants import PlantSpec, frequency_response
 
 __all__ = ["AxisMotion", "judge"]
 
-Array = NDArray[np.float64]
 Spectrum = NDArray[np.complex128]
 
 _BAND_HZ = (5.0, 200.0)
@@ -58,8 +58,6 @@ def judge(axis: AxisMotion, dt_s: float) -> AxisReadback:
     ----------
     axis : AxisMotion
         Predicted and measured acceleration, aligned but for a millisecond or so.
-    dt_s : float
-        Sampling time.
     """
     n = len(axis.measured)
     window = tukey(n, 0.02)

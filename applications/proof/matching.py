@@ -17,13 +17,12 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import butter, correlate, sosfiltfilt
 from scipy.stats import theilslopes
 
+from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.readers import read_measurements
 from stillpath.models.identification.types import AccelerationLog
 
 __all__ = ["Match", "Signal", "band_pass", "log_signal", "match", "read_log"]
-
-Array = NDArray[np.float64]
 
 _COARSE_HZ = 125.0
 _COARSE_BAND_HZ = (2.0, 22.0)
@@ -71,8 +70,6 @@ class Match:
         The part of the plan that the log follows without a jump.
     offset_s, rate : float
         Log time = offset_s + rate * plan time.
-    log_s : float
-        Length of the log.
     places : int
         Places in the plan that fit about as well (repeated layers); the best one was taken.
     """
@@ -102,7 +99,6 @@ def read_log(path: Path, otherwise: str) -> AccelerationLog:
 
     Parameters
     ----------
-    path : Path
     otherwise : str
         Advice in the message about a file of another kind.
 
@@ -148,7 +144,6 @@ def match(plan: Signal, log: Signal) -> Match:
     ----------
     plan : Signal
         Predicted acceleration of the nozzle, rows x y, from time 0 on.
-    log : Signal
     """
     segment_s = float(np.clip(log.duration_s / 8.0, *_SEGMENTS_S))
     coarse_plan, coarse_log = (_coarse(signal) for signal in (plan, log))

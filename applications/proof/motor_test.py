@@ -102,7 +102,6 @@ def borne(levels: list[Level], console: str, full_step: int) -> int:
 
     Parameters
     ----------
-    levels : list of Level
     console : str
         The console's text or klippy.log; its last answers to GET_POSITION count.
     full_step : int

@@ -14,19 +14,7 @@ _SIZE = (480.0, 290.0)
 
 
 def write_readback(report: ReadbackReport, directory: Path) -> None:
-    """Write readback.html and readback.json into a folder, each whole or not at all.
-
-    Parameters
-    ----------
-    report : ReadbackReport
-    directory : Path
-        Made if it does not exist.
-
-    Raises
-    ------
-    OSError
-        If the folder or a file cannot be written.
-    """
+    """Write readback.html and readback.json into a folder by `reports.pages.write_texts`."""
     page = render_readback(report)
     write_texts(directory, {"readback.json": report.model_dump_json(), "readback.html": page})
 

@@ -98,11 +98,6 @@ def place(
 class Program:
     """Write a print.
 
-    Parameters
-    ----------
-    machine : Machine
-    settings : PrintSettings
-
     Attributes
     ----------
     width_mm, layer_mm : float

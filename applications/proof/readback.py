@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillpath.applications.proof.figures import ReadbackReport
 from stillpath.applications.proof.judging import AxisMotion, judge
@@ -19,6 +18,7 @@ from stillpath.applications.proof.matching import (
     match,
     read_log,
 )
+from stillpath.models.arrays import Array
 from stillpath.models.machine import Machine
 from stillpath.models.plants import PlantSpec, discretise
 from stillpath.pipeline.progress import ProgressCallback
@@ -27,8 +27,6 @@ from stillpath.simulation.response import PlantStream
 from stillpath.version import __version__
 
 __all__ = ["verify_log"]
-
-Array = NDArray[np.float64]
 
 _RECORD = "record with ACCELEROMETER_MEASURE (Klipper) or M956 (RepRapFirmware) during the print"
 _RATE_HZ = 1000.0
@@ -55,7 +53,6 @@ def verify_log(
         The G-code that was printed, compensated or not.
     log : Path
         Klipper's or RepRapFirmware's raw accelerations; any part of the print.
-    machine : Machine
     progress : callable, optional
         Called while the file is planned.
 

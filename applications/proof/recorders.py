@@ -34,12 +34,7 @@ class RingSettings:
 
 
 class Recorder:
-    """Lines around a ring test; the base class, for firmware without a sensor, has none.
-
-    Parameters
-    ----------
-    settings : RingSettings
-    """
+    """Lines around a ring test; the base class, for firmware without a sensor, has none."""
 
     instruction: tuple[str, ...] = (
         "This firmware logs no accelerations: fix a sensor with a logger of its own to the part",

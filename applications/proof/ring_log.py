@@ -16,6 +16,7 @@ from scipy.signal.windows import tukey
 from stillpath.applications.proof.matching import Match, Signal, band_pass, log_signal, match
 from stillpath.applications.proof.ring_motion import RATE_HZ, RingMotion, Stop
 from stillpath.applications.proof.ring_test import Axis
+from stillpath.models.arrays import Array
 from stillpath.models.identification.readers.checks import check_range
 from stillpath.models.identification.types import AccelerationLog
 
@@ -31,8 +32,6 @@ __all__ = [
     "read_axis",
     "residual",
 ]
-
-Array = NDArray[np.float64]
 
 WINDOW_S = (0.01, 0.31)
 """Evaluated time after a stop; the clock is known to about a millisecond."""

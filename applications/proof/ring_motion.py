@@ -20,6 +20,7 @@ from stillpath.applications.proof.ring_test import (
     plants_line,
     region,
 )
+from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
 from stillpath.models.plants import PlantSpec, discretise
@@ -29,8 +30,6 @@ from stillpath.pipeline.reading import dialect_for
 from stillpath.simulation.response import PlantStream
 
 __all__ = ["RingMotion", "Stop", "is_ring_test", "predicted", "read_ring_motion"]
-
-Array = NDArray[np.float64]
 
 RATE_HZ = 1000.0
 _HEAD_BYTES = 4096
@@ -61,7 +60,6 @@ class RingMotion:
     ----------
     command : Signal
         Positions of X and Y in mm.
-    stops : tuple of Stop
     quiet_s : dict
         By axis from when until when it stands still long before it moves (the other one creeps, as
         after the stops).

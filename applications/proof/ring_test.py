@@ -62,11 +62,6 @@ _TRAVEL_MM_S = 100.0
 class RingTest:
     """Writes a ring test, which only moves.
 
-    Parameters
-    ----------
-    machine : Machine
-    settings : RingSettings
-
     Raises
     ------
     ModelError
@@ -204,10 +199,8 @@ def write_ring_test(
 
     Parameters
     ----------
-    machine : Machine
     target : Path
         Written whole or not at all.
-    settings : RingSettings, optional
     cache_dir, progress
         As of `pipeline.compensate.compensate_file`.
 

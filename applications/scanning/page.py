@@ -28,13 +28,7 @@ _LINES = {"sent": "before thin", "prefilter": "shaper thin", "add-on": "after ma
 
 
 def write_scan(report: ScanReport, directory: Path) -> None:
-    """Write scan.html and scan.json into a folder, each whole or not at all.
-
-    Raises
-    ------
-    OSError
-        If the folder or a file cannot be written.
-    """
+    """Write scan.html and scan.json into a folder by `reports.pages.write_texts`."""
     page = render_scan(report)
     write_texts(directory, {"scan.json": report.model_dump_json(), "scan.html": page})
 

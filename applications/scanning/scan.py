@@ -23,6 +23,7 @@ from stillpath.compensation.feedback.preview_command import preview_command
 from stillpath.compensation.feedback.zero_phase import design_prefilter
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.hatches import Hatches, ScanSamples, Timing, read_hatches, sample_hatches
+from stillpath.models.arrays import Array
 from stillpath.models.diagrams import Block
 from stillpath.models.disturbances import DisturbanceSpec, sample
 from stillpath.models.loops import Loop, LoopSpec
@@ -32,7 +33,6 @@ from stillpath.version import __version__
 
 __all__ = ["Prefiltering", "Scan", "ScanSettings", "scan_file"]
 
-Array = NDArray[np.float64]
 Prefiltering = Literal["zpetc", "fbf", "none"]
 
 _LARGEST_FILE = 64 << 20
@@ -52,7 +52,6 @@ class ScanSettings:
     prefilter : "zpetc", "fbf" or "none"
     cutoff_hz : float, optional
         Of a zero-phase low-pass after zpetc.
-    timing : Timing
     disturbance : optional
         In the machine's unit. Left out, the controller's own, scaled to `disturbance_um`.
     enters : "output" or "input", optional
@@ -75,7 +74,6 @@ class Scan:
 
     Attributes
     ----------
-    report : ScanReport
     t_s : ndarray, shape (n,)
     command : ndarray, shape (2, n)
         References of both axes in the machine's unit.

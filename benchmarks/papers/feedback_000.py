@@ -27,12 +27,12 @@ from stillpath.compensation.feedback.fmsdob import (
     instant_check,
 )
 from stillpath.compensation.feedback.inverse_dob import inverse_dob
+from stillpath.models.arrays import Array
 from stillpath.models.diagrams import polynomial_response
 from stillpath.models.disturbances import Switched, Tone, sample
 from stillpath.models.loops import Loop, load_loop
 from stillpath.simulation.closed_loop import ClosedLoop, Imperfections, simulate
 
-Array = NDArray[np.float64]
 PRINTED = Loop((0, 0, 0.0282, 0.1504, 0.1146), (1, -1.319, 0.929, -0.6073, -0.0035), 2.5e-5)
 FAST = load_loop("galvo-40khz").nominal()
 SLOW = load_loop("galvo-10khz")

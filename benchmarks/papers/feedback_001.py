@@ -11,15 +11,14 @@ from collections.abc import Iterator
 
 import numpy as np
 from feedback_records import Row, checked, rate, shown
-from numpy.typing import NDArray
 
 from stillpath.compensation.feedback.controller import Controller, Refusal
 from stillpath.compensation.feedback.mmp import mmp, predictor, singular_distance_hz
+from stillpath.models.arrays import Array
 from stillpath.models.diagrams import Block, polynomial_response
 from stillpath.models.loops import load_loop
 from stillpath.simulation.closed_loop import ClosedLoop, simulate
 
-Array = NDArray[np.float64]
 SPEC = load_loop("galvo-camera")
 LOOP = SPEC.nominal()
 NYQUIST_HZ = 1e4 / 6

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from feedback_records import Row, checked, rate, shown
-from numpy.typing import NDArray
 from scipy.signal import cont2discrete
 
 from stillpath.compensation.feedback.disturbance_observer import (
@@ -27,15 +26,13 @@ from stillpath.compensation.feedback.pd import Margins, inertia_pd, loop_margins
 from stillpath.compensation.feedback.zero_phase import design_prefilter
 from stillpath.compensation.inversion import invert
 from stillpath.compensation.inverting import zero_phase_fir
+from stillpath.models.arrays import Array
 from stillpath.models.diagrams import Block, polynomial_response
 from stillpath.models.disturbances import SensorSpec
 from stillpath.models.loops import Loop, load_loop
 from stillpath.models.plants import Mode, ModesSpec, continuous
 from stillpath.simulation.closed_loop import ClosedLoop, Imperfections, simulate
 from stillpath.simulation.response import response
-
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 LOOPS = load_loop("direct-drive-table").loops()
 TABLE = LOOPS[0]

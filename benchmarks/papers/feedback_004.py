@@ -12,7 +12,6 @@ from collections.abc import Iterator
 
 import numpy as np
 from feedback_records import Row, checked, rate, shown
-from numpy.typing import NDArray
 
 from stillpath.compensation.feedback.controller import Refusal
 from stillpath.compensation.feedback.multirate import (
@@ -29,11 +28,9 @@ from stillpath.compensation.feedback.repetitive import (
     periodic_residual,
     plug_in_factor,
 )
+from stillpath.models.arrays import Array, Complex
 from stillpath.models.loops import Loop, ServoLoop, load_loop
 from stillpath.simulation.closed_loop import ClosedLoop, simulate
-
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 
 def as_printed(name: str) -> Loop:

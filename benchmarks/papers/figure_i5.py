@@ -37,6 +37,7 @@ from stillpath.compensation.nominal_frequency import (
     sampled_responses,
 )
 from stillpath.compensation.operators import LiftedOperator
+from stillpath.models.arrays import Array
 from stillpath.models.plants import DiscretePlant, PlantSetSpec, WeightedMember, plant_set
 from stillpath.models.store import load_machine
 
@@ -48,7 +49,6 @@ ACCELERATIONS = np.round(np.arange(2.0, 5.01, 0.2), 1)
 FREQUENCY_SPREAD, DAMPING_SPREAD = 0.06, 1.6
 _QUANTILES = 400
 
-Array = NDArray[np.float64]
 Row = tuple[str, str, str, str]
 """Quantity, the paper's value, ours, and what the comparison is."""
 

@@ -6,9 +6,9 @@ import time
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from stillpath.models.arrays import Array
+
 Row = tuple[str, str, str, str]
 """Quantity, the paper's value, ours, and where the difference comes from."""
 

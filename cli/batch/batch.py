@@ -30,9 +30,6 @@ def run_batch(
 
     Parameters
     ----------
-    worker_pool : WorkerPool
-    output : OutputFolder
-    items : sequence of Item
     tell : callable, optional
         Is given every outcome as it comes.
     check : callable, optional

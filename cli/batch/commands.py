@@ -13,14 +13,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from stillpath.cli.arguments import CompensationOptions, KeyOption, ServerOption
-from stillpath.cli.option_groups import grouped
 
 if TYPE_CHECKING:
     from stillpath.cli.batch.output import Outcome, OutputFolder
     from stillpath.cli.batch.worker_pool import WorkerPool
     from stillpath.pipeline.options import Options
 
-__all__ = ["register"]
+__all__ = ["batch", "watch"]
 
 _AT_A_SERVER = 8
 
@@ -54,12 +53,6 @@ class WorkOptions:
     ] = None
     server: ServerOption = None
     key: KeyOption = None
-
-
-def register(app: typer.Typer) -> None:
-    """Add batch and watch to a command line."""
-    for command in (batch, watch):
-        app.command()(grouped(command))
 
 
 def batch(

@@ -32,7 +32,6 @@ class Item:
 
     Attributes
     ----------
-    source : Path
     place : str
         The file's name, below the folder that was named if one was: ``plates/part.gcode``.
     machine : str

@@ -31,7 +31,6 @@ class There:
     ----------
     client : Client
         Closed by `close`.
-    options : Options
     batch : str
         What the jobs have in common; the same one finds them again.
     """

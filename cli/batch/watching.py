@@ -55,10 +55,8 @@ class Watcher:
 
     Parameters
     ----------
-    folder : Path
     group : Group
         Machines of every file.
-    worker_pool : WorkerPool
     output : OutputFolder
         May lie in the watched folder.
     settle_s : float
@@ -180,8 +178,6 @@ def run_watch(watcher: Watcher, folder: Path, *, every_s: float, check: Callable
 
     Parameters
     ----------
-    watcher : Watcher
-    folder : Path
     every_s : float
         For what no message tells of.
     check : callable

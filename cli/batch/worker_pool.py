@@ -68,8 +68,6 @@ class LocalPool:
 
     Parameters
     ----------
-    machines : Resolver
-    options : Options
     jobs : int
         Processes.
     """

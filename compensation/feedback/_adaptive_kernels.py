@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array
 from stillpath.models.jit import kernel
 
 __all__ = ["track"]
-
-Array = NDArray[np.float64]
 
 
 @kernel

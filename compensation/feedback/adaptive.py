@@ -14,19 +14,18 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial import chebyshev
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.feedback._adaptive_kernels import track
 from stillpath.compensation.feedback.controller import Controller
 from stillpath.compensation.feedback.fmsdob import QFilter, add_on_blocks, design_q, fmsdob
+from stillpath.models.arrays import Array
 from stillpath.models.diagrams import Block
 from stillpath.models.loops import Loop
 
 __all__ = ["AdaptiveFmsdob", "FrequencyTracker", "Retuning"]
 
-Array = NDArray[np.float64]
 _START_RADIUS, _END_RADIUS = 0.3, 0.98
 _START_FORGETTING, _END_FORGETTING = 0.9, 0.995
 _DECAY_SAMPLES = 25
@@ -45,7 +44,6 @@ class FrequencyTracker:
     tones : int
         At most 8. One locks within about 100 samples, three within about 500, even at a
         signal-to-noise ratio of 8 dB.
-    dt_s : float
     floor_rms : float
         Signals below this rms are ignored.
 
@@ -112,7 +110,6 @@ class AdaptiveFmsdob:
     ----------
     loops : sequence of Loop
         The nominal loop, then the members of its plant set.
-    tones : int
     bandwidth_hz : float
         Of the band pass.
     floor_rms : float

@@ -11,15 +11,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillpath.compensation.base import DesignError
+from stillpath.models.arrays import Array, Complex
 from stillpath.models.diagrams import Block, polynomial_response
 
 __all__ = ["LatticeBandPass"]
-
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillpath.compensation.base import DesignError
+from stillpath.models.arrays import Array, Complex
 from stillpath.models.diagrams import Block, Diagram
 from stillpath.models.disturbances import SensorSpec
 from stillpath.models.loops import Loop
@@ -31,8 +31,6 @@ __all__ = [
     "judged",
 ]
 
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 Values = float | int | tuple[float, ...] | tuple[tuple[float, ...], ...]
 Uncertainty = float | Callable[[Array], Array]
 """Bound of the relative plant error |Delta(f)|: one number, or a function of the frequencies."""
@@ -139,20 +137,16 @@ class Controller:
 
     Attributes
     ----------
-    method, machine : str
     dt_s : float
         Sampling time of the blocks.
-    coefficients : tuple of CoefficientSet
     blocks : tuple of Block
         The controller as difference equations, which `simulation.closed_loop` can run.
-    prediction : Prediction
     noise_gain : float
         rms of y per rms of white sensor noise, unless `notes` says otherwise.
     spectral_radii : tuple of float
         Of the whole loop, for the nominal plant and every member; all below 1.
     settings : mapping
         The requested design (targets, widths, ...), for the record.
-    notes : tuple of str
     """
 
     method: str
@@ -255,7 +249,6 @@ def judged(
 
     Parameters
     ----------
-    design : Design
     loops : sequence of Loop
         The nominal loop, then the members of its plant set.
     uncertainty : float or function of f_hz, optional

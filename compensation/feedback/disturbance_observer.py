@@ -15,7 +15,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 
 from stillpath.compensation.feedback.controller import (
@@ -28,6 +28,7 @@ from stillpath.compensation.feedback.controller import (
     frequency_grid,
     judged,
 )
+from stillpath.models.arrays import Array, Complex
 from stillpath.models.diagrams import Block, polynomial_response
 from stillpath.models.loops import Loop
 
@@ -38,9 +39,6 @@ __all__ = [
     "design_disturbance_observer",
     "observer_sensitivity",
 ]
-
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 _RADIUS = 0.97
 

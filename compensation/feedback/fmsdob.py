@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.feedback.bandpass import LatticeBandPass
@@ -32,6 +32,7 @@ from stillpath.compensation.feedback.controller import (
     judged,
 )
 from stillpath.compensation.feedback.interpolation import interpolating_fir, inverse_and_slope
+from stillpath.models.arrays import Array, Complex
 from stillpath.models.diagrams import Block
 from stillpath.models.loops import Loop
 
@@ -49,8 +50,6 @@ __all__ = [
     "target_angles",
 ]
 
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 Around = Literal["servo", "plant"]
 Shape = Literal["pointwise", "hermite"]
 
@@ -61,8 +60,6 @@ class QFilter:
 
     Attributes
     ----------
-    taps : tuple of float
-    band_pass : LatticeBandPass or None
     gain : float
         Detuning: below 1 the depth of the notches is 1 - gain.
     """
@@ -153,7 +150,6 @@ def fmsdob(
         against the sampling rate make Hermite filters amplify elsewhere: see `max_add_on`.
     bandwidth_hz : float, sequence of float, or None
         -3 dB width of the band pass; None: no band pass.
-    trim : Trim
     around : "servo" or "plant"
         Forward model, see the module.
     uncertainty : float or function of f_hz, optional

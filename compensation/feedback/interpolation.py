@@ -9,14 +9,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillpath.compensation.base import DesignError
+from stillpath.models.arrays import Array, Complex
 
 __all__ = ["interpolating_fir", "inverse_and_slope"]
 
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 _LARGEST_CONDITION = 1e10
 
 

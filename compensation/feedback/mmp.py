@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.feedback.controller import (
@@ -27,14 +27,13 @@ from stillpath.compensation.feedback.controller import (
     judged,
 )
 from stillpath.compensation.feedback.fmsdob import Shape, design_q, model_blocks
+from stillpath.models.arrays import Array, Complex
 from stillpath.models.diagrams import Block, polynomial_response
 from stillpath.models.disturbances import SensorSpec
 from stillpath.models.loops import Loop
 
 __all__ = ["Predictor", "mmp", "predictor", "predictor_of_gain", "singular_distance_hz"]
 
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 DEFAULT_NOISE_GAIN = 2.0
 _ALPHAS = (0.5, 0.7, 0.8, 0.85, 0.9, 0.93, 0.95, 0.97, 0.98, 0.99)
 

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from stillpath.compensation.feedback.controller import (
     Controller,
@@ -36,13 +36,11 @@ from stillpath.compensation.feedback.repetitive import (
     repetitive_coefficients,
     shared_period,
 )
+from stillpath.models.arrays import Array, Complex
 from stillpath.models.diagrams import Block
 from stillpath.models.loops import Loop
 
 __all__ = ["FastRate", "alias_spectra", "design_multirate", "fast_rate", "multirate_factor"]
-
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 _LARGEST_FACTOR = 32
 
@@ -74,7 +72,6 @@ def design_multirate(
         At the sampling rate: the nominal loop, then the members of its plant set.
     fast : Loop
         The same machine, identified at the fast rate; its servo is inverted.
-    fundamental_hz : float
     alpha, nyquist_pairs, notches_hz, uncertainty
         See `compensation.feedback.repetitive.design_wide_band`.
 

@@ -13,14 +13,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from stillpath.compensation.base import DesignError
+from stillpath.models.arrays import Complex
 from stillpath.models.loops import Loop
 
 __all__ = ["Margins", "inertia_pd", "loop_margins", "margins"]
-
-Complex = NDArray[np.complex128]
 
 _POINTS = 200_001
 

@@ -7,17 +7,15 @@ No zero is cancelled or approximated, so it helps where ZPETC's gain error shows
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillpath.compensation._preview_kernels import advance_window
 from stillpath.compensation.feedback.zero_phase import reference_plant
 from stillpath.compensation.lifted_window import lifted_window
 from stillpath.compensation.preview import PreviewDesign
+from stillpath.models.arrays import Array
 from stillpath.models.loops import Loop
 
 __all__ = ["preview_command"]
-
-Array = NDArray[np.float64]
 
 _WINDOW, _UPDATE = 64, 16
 """Samples in a window, and those committed per window."""

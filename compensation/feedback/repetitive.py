@@ -30,7 +30,7 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import diric
 
 from stillpath.compensation.feedback.controller import (
@@ -44,6 +44,7 @@ from stillpath.compensation.feedback.controller import (
     frequency_grid,
     judged,
 )
+from stillpath.models.arrays import Array, Complex
 from stillpath.models.diagrams import Block, polynomial_response
 from stillpath.models.loops import Loop
 
@@ -62,9 +63,6 @@ __all__ = [
     "repetitive_coefficients",
     "shared_period",
 ]
-
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 _RADIUS = 0.97
 _SERIES_LEFT = 1e-3
@@ -160,7 +158,6 @@ class ServoInverse:
         Powers of z^-1.
     preview : int
         Samples of look-ahead, to be compensated by a delay elsewhere.
-    notes : tuple of str
     blocks_constants : bool
         V(1) = 0: its input must be free of constants.
     """
@@ -192,9 +189,6 @@ def design_wide_band(
     ----------
     loops : sequence of Loop
         The nominal loop, then the members of its plant set.
-    fundamental_hz : float
-    alpha : float
-    nyquist_pairs : int
     notches_hz : sequence of float
         Frequencies at which the add-on has no effect.
     uncertainty

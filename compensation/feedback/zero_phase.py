@@ -4,8 +4,7 @@
 
 `compensation.inversion` inverts the loop's response to its reference; this module adds a low-pass,
 delays and a loadable form. The inverse's gain grows to tens of dB: without the low-pass the
-quantisation of a reference alone saturates a drive, so the FIR is on by default, with a cutoff
-that follows from the allowed acceleration.
+quantisation of a reference alone saturates a drive, so `cutoff_hz` should be given.
 """
 
 from __future__ import annotations
@@ -13,21 +12,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.feedback.controller import CoefficientSet, Extreme
 from stillpath.compensation.inversion import Inversion, invert
 from stillpath.compensation.inverting import zero_phase_fir
+from stillpath.models.arrays import Array, Complex
 from stillpath.models.loops import Loop
 from stillpath.models.plants import DiscretePlant, balanced_discrete
 
-__all__ = ["Prefilter", "design_prefilter", "fir_within", "reference_plant"]
+__all__ = ["Prefilter", "design_prefilter", "reference_plant"]
 
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
-
-_LADDER_STEP, _SLOWEST_HZ = 0.85, 10.0
 _PREVIEW = 5
 
 
@@ -37,9 +32,7 @@ class Prefilter:
 
     Attributes
     ----------
-    inversion : Inversion
     fir : ndarray, shape (2 l + 1,), or None
-    dt_s : float
     """
 
     inversion: Inversion
@@ -100,9 +93,8 @@ def design_prefilter(
 
     Parameters
     ----------
-    loop : Loop
     cutoff_hz : float, optional
-        Of the zero-phase FIR; None: no FIR (see `fir_within`).
+        Of the zero-phase FIR; None: no FIR.
     length : int
         l: the FIR looks l samples ahead.
 
@@ -117,41 +109,6 @@ def design_prefilter(
     inversion = invert("zpetc", reference_plant(loop), order=0, unit_dc=True)
     fir = None if cutoff_hz is None else zero_phase_fir(cutoff_hz, loop.dt_s, length)
     return Prefilter(inversion, fir, loop.dt_s)
-
-
-def fir_within(
-    loop: Loop,
-    y_d: Array,
-    accel_limit: float,
-    *,
-    length: int = _PREVIEW,
-) -> Prefilter:
-    """Return the prefilter with the highest cutoff that keeps an acceleration limit.
-
-    Parameters
-    ----------
-    y_d : ndarray, shape (n,)
-        A typical motion.
-    accel_limit : float
-        Units of y_d per s^2.
-
-    Raises
-    ------
-    DesignError
-        If even 10 Hz exceeds it.
-    """
-    cutoff_hz, needed = 0.4 / loop.dt_s, 0.0
-    while cutoff_hz >= _SLOWEST_HZ:
-        made = design_prefilter(loop, cutoff_hz=cutoff_hz, length=length)
-        needed = float(np.max(np.abs(np.diff(made.apply(y_d), 2)))) / loop.dt_s**2
-        if needed <= accel_limit:
-            return made
-        cutoff_hz *= _LADDER_STEP
-    raise DesignError(
-        f"even with a low-pass at {_SLOWEST_HZ:g} Hz ({length} samples ahead) the reference needs "
-        f"an acceleration of {needed:.4g} (limit {accel_limit:.4g}); take a longer low-pass, or "
-        "move more slowly"
-    )
 
 
 def reference_plant(loop: Loop) -> DiscretePlant:

@@ -35,8 +35,6 @@ class Container:
 
     Attributes
     ----------
-    kind : Kind
-    source : Path
     text : BinaryIO
         The G-code, seekable, open as long as the block of `open_text`.
     """
@@ -155,7 +153,6 @@ def rewriting(
 
     Parameters
     ----------
-    container : Container
     target : Path
         Is written in place: guard it.
     name : Path

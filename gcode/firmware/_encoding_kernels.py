@@ -7,11 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array
 from stillpath.models.jit import kernel
 
 __all__ = ["MoveLimits", "lay_out"]
-
-Array = NDArray[np.float64]
 
 
 class MoveLimits(NamedTuple):

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array, Ints
 from stillpath.models.jit import kernel
 
 __all__ = [
@@ -30,9 +31,6 @@ __all__ = [
     "list_places",
     "nearly_back",
 ]
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 MOST_PLACES = 13
 """Candidate places of a vertex in slow motion; elsewhere `_PLACES`."""
@@ -101,7 +99,6 @@ class Rules(NamedTuple):
         shorter of two segments; what does not fit is made to cost as much. Then a gentle
         acceleration, beyond which it is to cost something, too, where a motor makes more steps per
         sample than the third number.
-    corexy : bool
     """
 
     least: int
@@ -294,8 +291,6 @@ def choose_vertices(
         a step of X.
     heading : ndarray, shape (m, 2)
         The path's direction there, a unit vector.
-    rules : Rules
-    answer : Answer
     chosen : ndarray of int64, shape (n,)
         Filled: the number of the vertex' place, -1 where it is left out.
 

@@ -149,7 +149,6 @@ def limits_in_force(
     ----------
     rows : ndarray of int64, shape (n,)
         Row of the piece for a rest's own move, -1 for a segment.
-    stream : sequence of Limits
     level : ndarray of int64, shape (n,)
         Index into `stream` for each segment.
     """

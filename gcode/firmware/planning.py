@@ -90,7 +90,6 @@ def check_moves_end(phases: Phases, line: Callable[[int], int]) -> None:
 
     Parameters
     ----------
-    phases : Phases
     line : callable
         Gives the source line of a `Phases.move_index`.
 

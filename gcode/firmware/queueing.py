@@ -113,6 +113,11 @@ class QueuePlanner(ABC):
         """Return whether it is worthwhile to look for settled moves."""
         return True
 
+    def _drop(self, settled: int) -> None:
+        """Move the unsettled rows to the front."""
+        self._queue[: self._count - settled] = self._queue[settled : self._count]
+        self._count -= settled
+
     @abstractmethod
     def _append(self, moves: Moves, rows: slice) -> tuple[int, int]:
         """Enter moves after the rows in use; return a problem (or -1) and its row of `rows`."""

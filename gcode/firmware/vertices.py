@@ -43,13 +43,10 @@ class Lattice:
         First and last step of X and Y.
     least : int
         Fewest steps of a move.
-    corexy : bool
     speed_step_mm_s : float
         Largest step of a motor's speed.
     spare_steps : float
         Steps within a segment that rounding may add to that.
-    accel_mm_s2 : float
-        Acceleration of the moves.
     moves_per_s : float
         Rate at which moves arrive.
     fast_mm_s, fast_accel_mm_s2 : float
@@ -104,8 +101,6 @@ def vertices_on_steps(lattice: Lattice, timeline: Timeline, segments: Segments) 
 
     Parameters
     ----------
-    lattice : Lattice
-    timeline : Timeline
     segments : Segments
         At least one, fitted much finer than the steps. Where they have no `error_filter`, all
         errors count alike.

@@ -62,7 +62,6 @@ class StreamWriter:
 
     Parameters
     ----------
-    firmware : FirmwareAdapter
     stamp : str
         Version and options; one line in header and footer.
     """
@@ -137,7 +136,6 @@ class StreamWriter:
 
         Parameters
         ----------
-        verbatim : VerbatimPart
         extruder_mm : float
             The printer's E after everything written so far.
 

@@ -43,7 +43,6 @@ class Mark:
 
     Attributes
     ----------
-    kind : MarkKind
     text : str
         Name of the feature or object in the slicer's own words (empty: none from here on); Z,
         height or width in mm; for a layer its Z, where the mark says it; else empty.

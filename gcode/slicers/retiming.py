@@ -68,7 +68,6 @@ class Retiming:
 
         Parameters
         ----------
-        text : bytes
         item : VerbatimPart, optional
             The lines that came, whose times are looked for in the text.
         delay_s : float or array_like, shape (n + 1,)

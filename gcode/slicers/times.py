@@ -33,11 +33,8 @@ class TimeField:
 
     Attributes
     ----------
-    kind : TimeKind
     start, end : int
         Bytes of the line that hold the number or duration.
-    text : bytes
-        Those bytes.
     seconds : float
         What they say; of `PERCENT` the per cent.
     unit_s : float

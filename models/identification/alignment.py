@@ -10,17 +10,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
 from scipy.interpolate import CubicSpline
 
+from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.excitation import VelocityProfile, klipper_psd, regenerate
 from stillpath.models.identification.types import AccelerationLog, Excitation, Spectrum
 
 __all__ = ["AlignedLog", "align", "check_pair", "resample", "spectrum_along"]
-
-Array = NDArray[np.float64]
 
 _BAND_HZ = 10.0
 _LEAST_CORRELATION = 0.6
@@ -40,7 +39,6 @@ class AlignedLog:
 
     Attributes
     ----------
-    rate_hz : float
     command_mm_s2, measured_mm_s2 : ndarray, shape (n,)
         The command as averages over the sampling interval (`VelocityProfile.cell_averages`), the
         measurement along `direction`; from just before the test to its end.

@@ -6,15 +6,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array, Complex
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.types import FrequencyResponse, Spectrum
 
 __all__ = ["aligned_to", "low_frequency_delay", "mean_response", "mean_spectrum", "on_grid"]
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 _COHERENT = 0.95
 _DELAYS_S = 20e-3
@@ -127,7 +124,7 @@ def aligned_to(response: FrequencyResponse, reference: FrequencyResponse) -> Fre
     return replace(response, response=turned)
 
 
-def low_frequency_delay(f_hz: Array, response: ComplexArray) -> float:
+def low_frequency_delay(f_hz: Array, response: Complex) -> float:
     """Return the delay [s] from the slope of the phase where the modulus is still flat.
 
     There the modes add little, each only 2 zeta/w.

@@ -65,7 +65,6 @@ def scheduled(
 
     Parameters
     ----------
-    found : AxisIdentification
     nominal : Fit
         Of the usual condition.
     fits : mapping of Condition to Fit

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.fft import next_fast_len, rfft
 from scipy.signal.windows import tukey
 
+from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.alignment import AlignedLog, align
 from stillpath.models.identification.local_model import (
@@ -37,7 +38,6 @@ __all__ = [
     "response_at",
 ]
 
-Array = NDArray[np.float64]
 Progress: TypeAlias = Callable[[str, float], None]
 """Called with a stage ("align", "estimate") and how much of it is done, 0 to 1."""
 

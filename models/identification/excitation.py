@@ -11,8 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.types import Excitation
 
@@ -25,8 +26,6 @@ __all__ = [
     "welch_kernel",
     "welch_length",
 ]
-
-Array = NDArray[np.float64]
 
 _KAISER_BETA = 6.0
 _WINDOW_S = 0.5

@@ -12,8 +12,8 @@ from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.averaging import low_frequency_delay, mean_response
 from stillpath.models.identification.mode_estimates import (
@@ -40,9 +40,6 @@ from stillpath.models.identification.types import Fit, FrequencyResponse, OrderT
 from stillpath.models.plants import PairsSpec
 
 __all__ = ["fit_response", "refit_response"]
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 _CLEARLY = 0.7
 """Each further pair must bring the residual below this share."""

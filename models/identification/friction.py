@@ -17,10 +17,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
 from scipy.signal.windows import tukey
 
+from stillpath.models.arrays import Array, Complex
 from stillpath.models.friction import bend_of
 from stillpath.models.identification.alignment import AlignedLog
 from stillpath.models.identification.estimation import plateau_gain
@@ -29,9 +29,6 @@ from stillpath.models.identification.types import FrequencyResponse
 from stillpath.models.plants import MOST_FRICTION_MM
 
 __all__ = ["Friction", "better_explained", "dry_friction", "freed"]
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 _SIZES_MM = 1e-3 * np.array(
     [0.0, 0.5, 1.0, 2.0, 3.5, 5.0, 7.0, 10.0, 14.0, 20.0, 28.0, 40.0, 57.0, 80.0, 100.0]
@@ -160,7 +157,7 @@ def _left(aligned: AlignedLog, response: FrequencyResponse) -> Array:
     return np.array([[left(late_s, size_mm) for size_mm in _SIZES_MM] for late_s in _LATE_S])
 
 
-def _earlier(f_hz: Array, late_s: float) -> ComplexArray:
+def _earlier(f_hz: Array, late_s: float) -> Complex:
     return np.asarray(np.exp(2j * np.pi * f_hz * late_s))
 
 
@@ -187,7 +184,7 @@ def _bend_rate(aligned: AlignedLog, response: FrequencyResponse) -> Array:
     return np.pad(np.diff(bend, 2), 1) / step_s**2
 
 
-def _extra(response: FrequencyResponse, f_hz: Array) -> ComplexArray:
+def _extra(response: FrequencyResponse, f_hz: Array) -> Complex:
     """Return G - 1 as it was measured, its level set aside."""
     own_hz = response.f_hz
     level = plateau_gain(response) or float(np.median(np.abs(response.response[:9])))

@@ -113,7 +113,6 @@ def identify(
 
     Parameters
     ----------
-    measured : sequence of Measured
     settings : ReadSettings, optional
         What the files do not carry.
     sources : sequence of SourceFile

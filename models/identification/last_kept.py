@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
+from stillpath.models.arrays import Array
 
 __all__ = ["last_kept"]
 
-Array = NDArray[np.float64]
 T = TypeVar("T")
 
 

@@ -14,14 +14,11 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array, Complex
 from stillpath.models.errors import ModelError
 
 __all__ = ["LocalResponse", "Transformed", "bins_needed", "local_response"]
-
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 _POWERS = 3
 _SHARED = 2 * _POWERS - 1

@@ -6,8 +6,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.estimation import plateau_gain
 from stillpath.models.identification.nozzle import Frame
@@ -28,8 +28,6 @@ __all__ = [
     "scale_warnings",
     "spectrum_level_warning",
 ]
-
-Array = NDArray[np.float64]
 
 _MOSTLY = 0.8
 _CROSS = 0.2

@@ -13,8 +13,8 @@ from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.averaging import low_frequency_delay, mean_response
 from stillpath.models.identification.fitting import fit_response, refit_response
@@ -39,7 +39,6 @@ from stillpath.models.plants import PairsSpec, RelativeModesSpec, frequency_resp
 
 __all__ = ["alternatives", "fit_modes", "of_poles", "refit"]
 
-Array = NDArray[np.float64]
 Modal: TypeAlias = Candidate[ModalStructure]
 
 _AS_GOOD, _EXPLAINED, _IRRELEVANT = 1.05, 1.3, 0.005

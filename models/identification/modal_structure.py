@@ -13,14 +13,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array, Complex
 from stillpath.models.plants import RelativeMode, RelativeModesSpec
 
 __all__ = ["ModalStructure"]
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,11 +44,11 @@ class ModalStructure:
         shares = theta[2 * n : 3 * n - 1]
         return np.exp(theta[:n]), np.exp(theta[n : 2 * n]), np.append(shares, 1.0 - shares.sum())
 
-    def response(self, theta: Array, f_hz: Array) -> ComplexArray:
+    def response(self, theta: Array, f_hz: Array) -> Complex:
         """Return G at the frequencies, shape (len(f_hz),)."""
         return self.response_and_gradient(theta, f_hz)[0]
 
-    def response_and_gradient(self, theta: Array, f_hz: Array) -> tuple[ComplexArray, ComplexArray]:
+    def response_and_gradient(self, theta: Array, f_hz: Array) -> tuple[Complex, Complex]:
         """Return G, shape (len(f_hz),), and its derivatives, shape (len(f_hz), size)."""
         s = np.asarray(1j * f_hz[:, None] / self.unit_hz, np.complex128)
         f, zeta, share = self.split(theta)
@@ -77,7 +74,7 @@ class ModalStructure:
             np.concatenate([by_f, by_zeta, by_share, by_grounded], axis=1),
         )
 
-    def log_gradient(self, theta: Array, f_hz: Array) -> ComplexArray:
+    def log_gradient(self, theta: Array, f_hz: Array) -> Complex:
         """Return the derivatives of log G, shape (len(f_hz), size)."""
         response, gradient = self.response_and_gradient(theta, f_hz)
         return np.asarray(gradient / response[:, None])

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array
 from stillpath.models.identification.pair_structure import PairStructure
 from stillpath.models.identification.types import ModeEstimate
 
@@ -18,8 +19,6 @@ __all__ = [
     "robust_covariance",
     "with_floor",
 ]
-
-Array = NDArray[np.float64]
 
 _FILLER_ZETA = 0.4
 _FILLER_DISTANCE = 0.03

@@ -17,10 +17,10 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.signal import find_peaks
 
+from stillpath.models.arrays import Array, Complex
 from stillpath.models.identification.last_kept import last_kept
 from stillpath.models.identification.modal_fit import of_poles
 from stillpath.models.identification.modal_structure import ModalStructure
@@ -28,9 +28,6 @@ from stillpath.models.identification.response_data import ResponseData, response
 from stillpath.models.identification.types import FrequencyResponse
 
 __all__ = ["Frame", "frame_of"]
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 _POINTS = 160
 _STARTS_HZ = (9.0, 13.0, 18.0, 25.0)
@@ -67,12 +64,12 @@ class Frame:
     mass_ratio: float
     level: float = 1.0
 
-    def reaction(self, f_hz: Array) -> ComplexArray:
+    def reaction(self, f_hz: Array) -> Complex:
         """Return R at the frequencies, shape (len(f_hz),)."""
         s = 1j * f_hz / self.f_hz
         return np.asarray(self.mass_ratio * s * s / (s * s + 2 * self.zeta * s + 1))
 
-    def reaction_gradient(self, f_hz: Array) -> ComplexArray:
+    def reaction_gradient(self, f_hz: Array) -> Complex:
         """Return dR by log f, log zeta and the mass ratio, shape (len(f_hz), 3)."""
         s = 1j * f_hz / self.f_hz
         unit = s * s / (s * s + 2 * self.zeta * s + 1)
@@ -92,7 +89,6 @@ def frame_of(measured: FrequencyResponse, near: Frame | None = None) -> Frame | 
 
     Parameters
     ----------
-    measured : FrequencyResponse
     near : Frame, optional
         What the response showed before friction was removed from it: look for this one again.
     """
@@ -131,7 +127,7 @@ class _Found:
         vector = np.concatenate([self.vector[:2], shaking, self.vector[2:]])
         return replace(self, vector=vector, shaken=True)
 
-    def model_and_gradient(self, f_hz: Array) -> tuple[ComplexArray, ComplexArray]:
+    def model_and_gradient(self, f_hz: Array) -> tuple[Complex, Complex]:
         """Return the response, shape (len(f_hz),), and its derivatives, (len(f_hz), parameters)."""
         late = np.exp(self.vector[0] - 2j * np.pi * f_hz * self.vector[1])
         frame, first = self.frame, 5 if self.shaken else 2
@@ -179,7 +175,7 @@ def _polished(data: ResponseData, start: _Found) -> _Found:
     high = np.concatenate([ends[:, 1], frame[:, 1], high])
 
     @last_kept
-    def known(vector: Array) -> tuple[ComplexArray, ComplexArray]:
+    def known(vector: Array) -> tuple[Complex, Complex]:
         return replace(start, vector=vector).model_and_gradient(data.f_hz)
 
     def residual(vector: Array) -> Array:

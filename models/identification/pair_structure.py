@@ -11,14 +11,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stillpath.models.arrays import Array, Complex
 from stillpath.models.plants import PairsSpec, PolePair, ZeroPair
 
 __all__ = ["PairStructure"]
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 # A zero exactly on the imaginary axis would make log G infinite at its frequency.
 _SMALL = 1e-9
@@ -50,7 +48,7 @@ class PairStructure:
         tau, *rest = np.split(np.asarray(theta, float), cuts)
         return float(tau[0]), rest[0], rest[1], rest[2], rest[3]
 
-    def response(self, theta: Array, f_hz: Array) -> ComplexArray:
+    def response(self, theta: Array, f_hz: Array) -> Complex:
         """Return G at the frequencies, shape (len(f_hz),)."""
         x = np.asarray(1j * f_hz / self.unit_hz, np.complex128)
         tau, log_f, log_z, log_fz, zz = self.split(theta)
@@ -58,7 +56,7 @@ class PairStructure:
         poles = _factors(x, log_f, np.exp(log_z))
         return np.asarray((1 + tau * x) * zeros.prod(axis=1) / poles.prod(axis=1))
 
-    def log_gradient(self, theta: Array, f_hz: Array) -> ComplexArray:
+    def log_gradient(self, theta: Array, f_hz: Array) -> Complex:
         """Return the derivatives of log G, shape (len(f_hz), size)."""
         x = np.asarray(1j * f_hz / self.unit_hz, np.complex128)
         tau, log_f, log_z, log_fz, zz = self.split(theta)
@@ -150,7 +148,7 @@ class PairStructure:
         return np.where(beyond, max(_UNSEEN_ZETA, least), least)
 
 
-def _factors(x: ComplexArray, log_f: Array, zeta: ArrayLike) -> ComplexArray:
+def _factors(x: Complex, log_f: Array, zeta: ArrayLike) -> Complex:
     """Return 1 + 2 zeta s/w + s^2/w^2 of every pair, shape (len(x), pairs)."""
     scaled = x[:, None] / np.exp(log_f)
     return np.asarray(1 + 2 * np.asarray(zeta) * scaled + scaled**2)

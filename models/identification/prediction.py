@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array
 from stillpath.models.identification.excitation import drive_spectrum
 from stillpath.models.identification.spectrum_model import spectrum_model
 from stillpath.models.identification.types import Excitation, Fit, Spectrum
 from stillpath.models.plants import PlantSpec, frequency_response
 
 __all__ = ["predicted_psd", "predicted_spectrum"]
-
-Array = NDArray[np.float64]
 
 _BIN_HZ = 1.5625
 _F_MAX_HZ = 200.0

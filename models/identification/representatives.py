@@ -7,14 +7,13 @@ from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array
 from stillpath.models.identification.types import ModeEstimate
 from stillpath.models.plants import PlantSpec, RelativeModesSpec, frequency_response
 
 __all__ = ["Population", "mode_spread", "representatives"]
 
-Array = NDArray[np.float64]
 P = TypeVar("P", bound=PlantSpec)
 
 MEMBERS = 16

@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from stillpath.models.arrays import Complex
 from stillpath.models.identification.averaging import aligned_to, mean_response, on_grid
 from stillpath.models.identification.frame import LIKELY, shaken, without_frame
 from stillpath.models.identification.modal_fit import alternatives, refit
@@ -24,9 +25,6 @@ from stillpath.models.identification.types import Fit, FrequencyResponse
 from stillpath.models.plants import PairsSpec, PlantSpec, RelativeModesSpec, frequency_response
 
 __all__ = ["explain_response"]
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 _SEED = 21
 _DRAWS = 32
@@ -153,6 +151,6 @@ def _rows(response: FrequencyResponse, rows: slice | NDArray[np.int64]) -> Frequ
     )
 
 
-def _turned(response: ComplexArray, reference: ComplexArray) -> ComplexArray:
+def _turned(response: Complex, reference: Complex) -> Complex:
     """Return the response with the sign of the reference."""
     return response if np.vdot(reference, response).real >= 0 else -response

@@ -6,15 +6,12 @@ from dataclasses import dataclass, replace
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from stillpath.models.arrays import Array, Complex
 from stillpath.models.identification.response_data import ResponseData
 
 __all__ = ["GAIN", "Candidate", "Structure", "delay_span", "judged", "least_error", "with_gain"]
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 GAIN = (1e-9, 1e9)
 """Bounds of the gain, wide enough for any two units."""
@@ -28,10 +25,10 @@ class Structure(Protocol):
     def unit_hz(self) -> float:
         """Unit of frequencies."""
 
-    def response(self, theta: Array, f_hz: Array) -> ComplexArray:
+    def response(self, theta: Array, f_hz: Array) -> Complex:
         """Return G at the frequencies, shape (len(f_hz),)."""
 
-    def log_gradient(self, theta: Array, f_hz: Array) -> ComplexArray:
+    def log_gradient(self, theta: Array, f_hz: Array) -> Complex:
         """Return the derivatives of log G, shape (len(f_hz), len(theta))."""
 
 
@@ -57,12 +54,12 @@ class Candidate(Generic[S]):
         """Delay of the recording."""
         return float(self.vector[1] / (2 * np.pi * self.structure.unit_hz))
 
-    def model(self, f_hz: Array) -> ComplexArray:
+    def model(self, f_hz: Array) -> Complex:
         """Return the response that would be measured, shape (len(f_hz),)."""
         nuisance = np.exp(self.vector[0] - 1j * f_hz / self.structure.unit_hz * self.vector[1])
         return np.asarray(nuisance * self.structure.response(self.theta, f_hz))
 
-    def gradient(self, f_hz: Array) -> ComplexArray:
+    def gradient(self, f_hz: Array) -> Complex:
         """Return the derivatives of the model, shape (len(f_hz), len(vector))."""
         delay = -1j * f_hz / self.structure.unit_hz
         logs = [np.ones(len(f_hz)), delay, self.structure.log_gradient(self.theta, f_hz)]

@@ -8,15 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array, Complex
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.averaging import low_frequency_delay
 from stillpath.models.identification.types import FrequencyResponse
 from stillpath.models.runs import runs
 
 __all__ = ["LEAST_COHERENCE", "ResponseData", "coherent", "coherent_part", "response_data"]
-
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 LEAST_COHERENCE = 0.95
 _RELATIVE_FLOOR = 0.02
@@ -41,7 +39,7 @@ class ResponseData:
     """
 
     f_hz: Array
-    response: ComplexArray
+    response: Complex
     weight: Array
     noise: float
     delay_s: float
@@ -139,7 +137,7 @@ def coherent_part(
     return share, (float(low), float(high)) if high > low else None
 
 
-def _roughness(h: ComplexArray) -> float:
+def _roughness(h: Complex) -> float:
     """Return the relative noise that third differences show, where no deviation is known."""
     third = np.abs(np.diff(h, 3)) / np.abs(h[2:-1])
     # Weights 1, 3, 3, 1; the median of a complex normal's modulus is sqrt(ln 2).

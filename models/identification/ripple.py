@@ -17,10 +17,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import ValidationError
 from scipy.linalg import block_diag
 
+from stillpath.models.arrays import Array, Complex
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.ripple_observability import (
     Observability,
@@ -34,9 +34,6 @@ from stillpath.models.ripple import AxisRipple, RippleHarmonic, RippleSide, Ripp
 from stillpath.models.runs import runs
 
 __all__ = ["PassLog", "RippleLearning", "WaveBasis", "learn_ripple", "update_ripple"]
-
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 _STEADY = 1e-3
 """Relative change of speed that still counts as steady."""
@@ -87,8 +84,6 @@ class RippleLearning:
 
     Attributes
     ----------
-    ripple : AxisRipple
-    observability : tuple of Observability
     explained : float
         Share of the log's deviation (rms) that the waves explain, 0..1.
     """
@@ -111,7 +106,6 @@ def learn_ripple(
     ----------
     passes : sequence of PassLog
         All positions or all accelerations.
-    basis : sequence of WaveBasis
     plant : DiscretePlant
         The axis, at the sampling time of the commands.
     homing_repeatability_mm : float

@@ -12,13 +12,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
 
 __all__ = ["Observability", "folded_distances", "observability", "refuse_unobservable"]
-
-Array = NDArray[np.float64]
 
 LARGEST_NOISE_GAIN = 4.0
 """Above, a harmonic is not observable: noise would count four times as much as for a wave alone."""

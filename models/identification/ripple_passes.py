@@ -45,7 +45,6 @@ def read_pass(text: str, source: str) -> PassLog:
 
     Parameters
     ----------
-    text : str
     source : str
         The file's name, for messages.
 
@@ -96,7 +95,6 @@ def learn_machine_ripple(
 
     Parameters
     ----------
-    machine : Machine
     axis : str
         Input ripple of CoreXY belongs to its motors ``a`` and ``b``, all else to ``x`` and ``y``.
     passes, basis, homing_repeatability_mm

@@ -8,17 +8,15 @@ polynomials", IEEE Trans. Automatic Control 8 (1963): minimise |B - H A|^2, weig
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+
+from stillpath.models.arrays import Array, Complex
 
 __all__ = ["pairs_of", "polynomial_basis", "sanathanan_koerner"]
 
-Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-
 
 def sanathanan_koerner(
-    basis: ComplexArray,
-    response: ComplexArray,
+    basis: Complex,
+    response: Complex,
     weight: Array,
     numerator: int,
     denominator: int,
@@ -64,7 +62,7 @@ def sanathanan_koerner(
     return best
 
 
-def polynomial_basis(x: ComplexArray, degree: int) -> ComplexArray:
+def polynomial_basis(x: Complex, degree: int) -> Complex:
     """Return x^0 ... x^degree, shape (len(x), degree + 1)."""
     return np.asarray(np.vander(x, degree + 1, increasing=True), np.complex128)
 
@@ -95,7 +93,7 @@ def pairs_of(coefficients: Array) -> tuple[Array, Array]:
     return pairs, np.array(left)
 
 
-def _least_squares(matrix: ComplexArray, right: ComplexArray) -> Array:
+def _least_squares(matrix: Complex, right: Complex) -> Array:
     """Solve for real unknowns, columns scaled to equal size."""
     real = np.vstack([matrix.real, matrix.imag])
     length = np.linalg.norm(real, axis=0)

@@ -13,13 +13,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array
 from stillpath.models.identification.spectrum_model import SpectrumModel
 
 __all__ = ["SCATTERS", "Scatter"]
-
-Array = NDArray[np.float64]
 
 _DB = 10 / np.log(10)
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from datetime import date
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.averaging import mean_response
 from stillpath.models.identification.frame import LIKELY
@@ -48,8 +48,6 @@ __all__ = [
     "response_set",
     "spectrum_set",
 ]
-
-Array = NDArray[np.float64]
 
 PARAMETRIC_SPREAD: dict[str, tuple[float, float]] = {
     "raw log": (0.02, 0.20),

@@ -11,8 +11,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.types import Spectrum
 from stillpath.models.shaper_pulses import Pulses, shaper_pulses
@@ -25,15 +26,13 @@ __all__ = [
     "residual_vibration",
 ]
 
-Array = NDArray[np.float64]
-
 _LOWEST_HZ = {"zv": 21.0, "mzv": 23.0, "ei": 29.0, "2hump_ei": 39.0, "3hump_ei": 48.0}
 _HIGHEST_HZ = 200.0
 _STEP_HZ = 0.2
 _DAMPING = 0.1
 _TESTED_DAMPING = (0.075, 0.1, 0.15)
 _REDUCTION = 20.0
-_ACCEL_MM_S2 = 5000.0
+_ACCEL_MM_S2, _CORNER_MM_S = 5000.0, 5.0
 _TARGET_SMOOTHING_MM = 0.12
 
 
@@ -74,9 +73,7 @@ def choose_shaper_of(spectrum: Spectrum) -> tuple[ShaperChoice, tuple[ShaperChoi
     return choose_shaper(spectrum.f_hz, rows)
 
 
-def choose_shaper(
-    f_hz: ArrayLike, psd: ArrayLike, *, corner_mm_s: float = 5.0
-) -> tuple[ShaperChoice, tuple[ShaperChoice, ...]]:
+def choose_shaper(f_hz: ArrayLike, psd: ArrayLike) -> tuple[ShaperChoice, tuple[ShaperChoice, ...]]:
     """Return the shaper that Klipper recommends, and every shaper at its best frequency.
 
     Parameters
@@ -84,8 +81,6 @@ def choose_shaper(
     f_hz : array_like, shape (n,)
     psd : array_like, shape (n,) or (data sets, n)
         Spectra of the acceleration, summed over the sensor's axes, not normalised.
-    corner_mm_s : float
-        Square corner velocity.
 
     Raises
     ------
@@ -101,7 +96,7 @@ def choose_shaper(
     best: ShaperChoice | None = None
     chosen: list[ShaperChoice] = []
     for name in _LOWEST_HZ:
-        tried = _tried(name, f, weighted, corner_mm_s)
+        tried = _tried(name, f, weighted)
         own = _least_smoothing(tried)
         if best is None or _clearly_better(own, best):
             best = own
@@ -134,7 +129,7 @@ def residual_vibration(pulses: Pulses, f_hz: ArrayLike, zeta: float) -> Array:
     return np.asarray(np.abs(left), np.float64)
 
 
-def _tried(name: str, f: Array, weighted: Array, corner_mm_s: float) -> list[ShaperChoice]:
+def _tried(name: str, f: Array, weighted: Array) -> list[ShaperChoice]:
     """Score a shaper at every frequency of Klipper's grid, the highest first."""
     grid = np.arange(_LOWEST_HZ[name], _HIGHEST_HZ, _STEP_HZ)[::-1]
     unit = shaper_pulses(name, 1.0, _DAMPING)
@@ -149,7 +144,7 @@ def _tried(name: str, f: Array, weighted: Array, corner_mm_s: float) -> list[Sha
             passed = np.maximum(passed, np.maximum(left * psd - floor, 0).sum(1) / whole)
     out = []
     for f_shaper, vibrations in zip(grid, passed, strict=True):
-        corner, per_accel, turn = _smoothing((unit[0], unit[1] / f_shaper), corner_mm_s)
+        corner, per_accel, turn = _smoothing((unit[0], unit[1] / f_shaper))
         smoothing = max(corner + per_accel * _ACCEL_MM_S2, turn * _ACCEL_MM_S2)
         limit = min((_TARGET_SMOOTHING_MM - corner) / per_accel, _TARGET_SMOOTHING_MM / turn)
         score = smoothing * (vibrations**1.5 + 0.2 * vibrations + 0.01)
@@ -161,14 +156,14 @@ def _tried(name: str, f: Array, weighted: Array, corner_mm_s: float) -> list[Sha
     return out
 
 
-def _smoothing(pulses: Pulses, corner_mm_s: float) -> tuple[float, float, float]:
+def _smoothing(pulses: Pulses) -> tuple[float, float, float]:
     """Return the rounding of a right angle (constant, per acceleration) and of a full turn."""
     weights, times = pulses
     late = times - weights @ times
     after = np.maximum(late, 0)
     root = np.sqrt(2.0)
     return (
-        float(root * corner_mm_s * (weights @ after)),
+        float(root * _CORNER_MM_S * (weights @ after)),
         float(root / 2 * (weights @ after**2)),
         float(weights @ late**2 / 2),
     )

@@ -15,7 +15,6 @@ from copy import deepcopy
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.averaging import mean_spectrum
@@ -47,8 +46,6 @@ from stillpath.models.identification.types import (
 from stillpath.models.plants import RelativeModesSpec
 
 __all__ = ["Explained", "Explanations", "explanations", "refit_spectrum"]
-
-Array = NDArray[np.float64]
 
 _GOOD_DB, _NO_WORSE = 1.0, 1.1
 

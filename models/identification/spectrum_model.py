@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.excitation import (
     drive_spectrum,
@@ -17,8 +17,6 @@ from stillpath.models.identification.modal_structure import ModalStructure
 from stillpath.models.identification.types import Excitation, Spectrum
 
 __all__ = ["SpectrumModel", "cross_axis_share", "driven_column", "spectrum_model"]
-
-Array = NDArray[np.float64]
 
 _LOWEST_HZ = 8.0
 _BELOW_END_HZ = 3.0

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.last_kept import last_kept
 from stillpath.models.identification.modal_structure import ModalStructure
@@ -22,8 +23,6 @@ from stillpath.models.identification.types import Excitation, ModeEstimate, Spec
 from stillpath.models.plants import PlantSpec, RelativeModesSpec, frequency_response
 
 __all__ = ["Candidate", "Search", "whitening_of"]
-
-Array = NDArray[np.float64]
 
 _DB = 10 / np.log(10)
 _SEED = 20

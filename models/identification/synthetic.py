@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.excitation import VelocityProfile, klipper_psd, regenerate
 from stillpath.models.identification.types import AccelerationLog, Excitation, Spectrum
@@ -29,8 +30,6 @@ __all__ = [
     "write_raw_data",
     "write_table",
 ]
-
-Array = NDArray[np.float64]
 
 _GRAVITY_MM_S2 = np.array([0.0, 0.0, 9806.65])
 _STOP_MM_S2 = 3000.0
@@ -52,7 +51,6 @@ class Sensor:
         From the machine's axes to the sensor's.
     delay_s : float
         Readings are this late.
-    gain : float
     jitter_s : float
         Standard deviation of the error of each time stamp.
     """
@@ -118,7 +116,6 @@ def simulate_log(
         The test's true start, on the clock of the log.
     lead_s, tail_s : float
         Rest that is recorded before and after. Negative: the log begins late or ends early.
-    rng : numpy.random.Generator
 
     Returns
     -------

@@ -8,6 +8,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array
 from stillpath.models.plants import PlantSetSpec, PlantSpec
 from stillpath.models.schedule import AxisSchedule
 
@@ -24,8 +25,6 @@ __all__ = [
     "PlantModel",
     "Spectrum",
 ]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,7 +218,6 @@ class AxisIdentification:
         Of the nominal plant; None for a model that was read.
     measured : tuple
         FrequencyResponse or Spectrum, one per measurement.
-    member_fits : tuple of Fit
     schedule : AxisSchedule, optional
         If the axis was measured with a weight on the bed, or at several places.
     warnings, notes : tuple of str

@@ -6,18 +6,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillpath.gcode.firmware.base import Adviser
 from stillpath.gcode.pacing import FirstLayer
 from stillpath.gcode.slicers.features import Feature, feature_of
 from stillpath.gcode.types import KEPT, Limits, Moves
+from stillpath.models.arrays import Array, Mask
 from stillpath.models.shaping import Shaping
 
 __all__ = ["KEPT_FEATURES", "Advice", "Bound", "is_visible", "wanted_accel"]
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 KEPT_FEATURES = frozenset(
     {

@@ -141,8 +141,6 @@ class AsSliced:
 
     Attributes
     ----------
-    names : sequence of str
-        Names of the features.
     shaping : Shaping
         The printer's shaper.
     errors_um : mapping
@@ -171,10 +169,6 @@ def choose(
 
     Parameters
     ----------
-    samples : FileSamples
-    sliced : AsSliced
-    machine : Machine
-    adviser : Adviser
     budget_um : float, optional
         Error allowed to every feature; None: its error as sliced.
     progress : callable, optional

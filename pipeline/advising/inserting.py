@@ -45,8 +45,6 @@ class AdviceWriter:
 
     Parameters
     ----------
-    adviser : Adviser
-    advice : Advice
     names : list of str
         Feature names of the reader; the list grows as the file is read.
     initial : Limits
@@ -56,8 +54,6 @@ class AdviceWriter:
 
     Attributes
     ----------
-    lines : int
-        Number of inserted lines.
     shaper_left : bool
         At the end the printer's previous shaper was unknown: ours stays, at least in part.
     """
@@ -242,7 +238,6 @@ def write_advised(
     source, out : binary files
     reader : Interpreter
         Unused so far; the writer shares its list of feature names.
-    writer : AdviceWriter
     """
     out.seek(0)
     out.truncate()

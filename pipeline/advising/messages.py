@@ -44,7 +44,6 @@ def stored_settings(lines: Sequence[int], *, shaper: str | None) -> list[str]:
 
     Parameters
     ----------
-    lines : sequence of int
     shaper : str, optional
         Shaper restored before them; empty: it was never changed; None: unknown, so none is
         advised.
@@ -73,12 +72,10 @@ def beyond_bounds(
 
     Parameters
     ----------
-    features : sequence of AdvisedFeature
     lowest_mm_s2 : float
         The lowest acceleration that was tried.
     helpless : sequence of str
         Names of features that no acceleration would bring within their bounds.
-    has_budget : bool
     """
     return [
         f"{feature.name}: {feature.after_um:.1f} µm are predicted, more than the "

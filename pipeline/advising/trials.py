@@ -17,6 +17,7 @@ from stillpath.gcode.firmware.base import Adviser
 from stillpath.gcode.plan import plan_moves
 from stillpath.gcode.sampler import sample_phases
 from stillpath.gcode.types import Phases
+from stillpath.models.arrays import Array, Ints
 from stillpath.models.machine import Machine
 from stillpath.models.schedule import OperatingPoint
 from stillpath.models.shaping import AxisShaper, Shaping
@@ -27,9 +28,6 @@ from stillpath.simulation.measures import PathDistances
 from stillpath.simulation.scheduled import MachineStream
 
 __all__ = ["Trial"]
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 _REST_S = 0.15
 _POINTS = 600
@@ -54,12 +52,8 @@ class Trial:
 
     Parameters
     ----------
-    samples : FileSamples
     bounds : mapping
         Feature id to the bounds of its acceleration.
-    machine : Machine
-    adviser : Adviser
-    dt_s : float
     members : sequence
         Of `pipeline.measuring.set_errors.machine_numbers`.
     point : OperatingPoint, optional

@@ -58,7 +58,6 @@ class LastCheck:
         Receives what is written.
     original : binary file
         Text of the original, read from its beginning.
-    machine : Machine
     step_mm : tuple of float
         Grid of the firmware's x, y, z; 0: none. Streams may end one grid step off.
     shortest_mm : float

@@ -76,10 +76,8 @@ class Wanted:
 
     Attributes
     ----------
-    line : int
     code, array : bytes, uint8 array
         The line in two forms; empty at the end of the file.
-    kind : Kind
     mask : int
         Words of a plain move (`Reader.carry_out`).
     before : float array
@@ -113,7 +111,6 @@ class Original:
     ----------
     source : binary file
         Read from its beginning, and again after `go_to`.
-    reader : Reader
 
     Attributes
     ----------

@@ -63,7 +63,6 @@ class Reader:
 
     Parameters
     ----------
-    rules : Rules
     shortest_mm : float
         Shorter moves of X and Y may be merged into the next one, and left unchanged.
 

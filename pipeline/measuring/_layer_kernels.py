@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array, Ints
 from stillpath.models.jit import kernel
 
 __all__ = [
@@ -30,9 +31,6 @@ __all__ = [
     "State",
     "follow",
 ]
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 PEN_X, PEN_Y, PREVIOUS_X, PREVIOUS_Y, SPARE, BEND, HEIGHT = range(7)
 """Indices of the floats of `follow`: last point, last sample, points allowed by the text so far,
@@ -125,13 +123,10 @@ def follow(
         `row` is an index into the moves.
     begin : int
         First sample to process.
-    moves : Columns
     first, until : int
         Number in the file of the first of the moves; moves before `until` end after the samples.
     point_bytes : float
         Size of a point.
-    state : State
-    points : Points
 
     Returns
     -------

@@ -12,13 +12,11 @@ from types import TracebackType
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array
 from stillpath.pipeline.measuring.points import MeasuredPoints
 
 __all__ = ["EarlierErrors"]
-
-Array = NDArray[np.float64]
 
 _ROWS = 1 << 16
 
@@ -30,7 +28,6 @@ class EarlierErrors:
     ----------
     folder : Path
         Folder of the temporary file.
-    channels : int
     """
 
     def __init__(self, folder: Path, channels: int) -> None:

@@ -34,7 +34,6 @@ def written_layers(folder: Path, channels: Sequence[str]) -> Iterator[LayerWrite
     ----------
     folder : Path
         Made if it does not exist.
-    channels : sequence of str
 
     Raises
     ------
@@ -58,7 +57,6 @@ class LayerWriter:
     ----------
     tiles, index : files
         Binary, and text.
-    channels : sequence of str
     """
 
     def __init__(self, tiles: IO[bytes], index: IO[str], channels: Sequence[str]) -> None:

@@ -15,11 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillpath.gcode.types import Moves
+from stillpath.models.arrays import Array
 from stillpath.pipeline.measuring import _layer_kernels as kernels
 
 __all__ = ["ERROR_UM", "TILE_POINTS", "UNKNOWN", "LayerRecorder", "LayerTile", "point_bytes"]
-
-Array = NDArray[np.float64]
 
 TILE_POINTS = 1 << 17
 """A layer with more points is split into several tiles."""
@@ -83,7 +82,6 @@ class LayerRecorder:
 
     Parameters
     ----------
-    channels : int
     sample_s : float
         Time from sample to sample.
     takers : sequence of callables
@@ -145,7 +143,6 @@ class LayerRecorder:
             Planned positions.
         z_mm, extruding, row : ndarray, shape (n,)
             `row` is an index into `moves`.
-        moves : Moves
         first_move : int
             Number of the first of them in the file.
         error_mm : ndarray, shape (channels, n)

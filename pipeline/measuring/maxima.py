@@ -11,15 +11,12 @@ measurement, and the others are few.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array
 from stillpath.pipeline.measuring.points import MotionSamples
 from stillpath.simulation.measures import ChosenMeter
 
 __all__ = ["RINGING_S", "Maxima"]
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 RINGING_S = 0.1
 """Time after the end of a line in which ringing counts."""
@@ -33,8 +30,6 @@ class Maxima:
 
     Parameters
     ----------
-    dt_s : float
-    channels : int
     exact : int, optional
         The channel whose largest errors on lines are found; None: no channel.
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillpath.gcode.slicers.features import feature_name, feature_title
+from stillpath.models.arrays import Array
 from stillpath.models.machine import Machine
 from stillpath.models.schedule import OperatingPoint
 from stillpath.pipeline.band import BandContent
@@ -39,8 +40,6 @@ from stillpath.simulation.measures import ContourErrors, GroupTally, MotionMeter
 
 __all__ = ["CHANNELS", "STRIDE", "UNCHANGED_CHANNELS", "Measurement"]
 
-Array = NDArray[np.float64]
-
 CHANNELS = ("before", "after", "shaper")
 """The measured channels, in the order of all tables."""
 UNCHANGED_CHANNELS = ("before", "shaper")
@@ -58,8 +57,6 @@ class Measurement:
 
     Parameters
     ----------
-    machine : Machine
-    dt_s : float
     shaper : BestShaper
         The reference shaper.
     names : tuple of str

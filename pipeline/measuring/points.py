@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillpath.gcode.types import Moves
+from stillpath.models.arrays import Array
 
 __all__ = ["MeasuredPoints", "MotionSamples", "part_of"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +25,6 @@ class MotionSamples:
     extruding : ndarray of bool, shape (n,)
     row : ndarray of int64, shape (n,)
         Row of `moves` that each sample belongs to.
-    moves : Moves
     first_move : int
         Number of the first of them in the file.
     sliced_mm : ndarray, shape (2, n), optional

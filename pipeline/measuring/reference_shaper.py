@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillpath.compensation.shapers import SHAPERS, shape_xy, shaper_pulses
+from stillpath.models.arrays import Array, Ints
 from stillpath.models.machine import Machine
 from stillpath.models.plants import DiscretePlant, discretise
 from stillpath.models.reference_motion import reference_limits, reference_motion_of
@@ -46,9 +47,6 @@ __all__ = [
     "tune_shaper",
     "tuning_digest",
 ]
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 _ZETA = 0.1
 _VERSION = 2

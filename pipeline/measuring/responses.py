@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillpath.compensation.shapers import shape
+from stillpath.models.arrays import Array
 from stillpath.models.machine import Machine
 from stillpath.models.schedule import EMPTY, OperatingPoint
 from stillpath.pipeline.measuring.points import MotionSamples
@@ -19,8 +20,6 @@ from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.simulation.scheduled import MachineStream
 
 __all__ = ["ResponseSamples", "Responses"]
-
-Array = NDArray[np.float64]
 
 _LEAST_SAMPLES = 4096
 
@@ -48,8 +47,6 @@ class Responses:
 
     Parameters
     ----------
-    machine : Machine
-    dt_s : float
     shaper : BestShaper
         Its delay is removed.
     names : sequence of str

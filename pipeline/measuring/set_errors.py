@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillpath.gcode.pacing import TRAVEL
+from stillpath.models.arrays import Array, Mask
 from stillpath.models.machine import Machine
 from stillpath.models.plants import plant_set
 from stillpath.models.schedule import EMPTY, OperatingPoint
@@ -16,9 +17,7 @@ from stillpath.simulation.scheduled import MachineStream
 
 __all__ = ["LANDING_S", "ClassError", "ErrorSum", "SetErrors", "machine_numbers"]
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
-Mask = NDArray[np.bool_]
 
 LANDING_S = 0.05
 """Extrusion this soon after a travel also counts for the travel, which excited the machine."""
@@ -40,7 +39,6 @@ class ErrorSum:
     ----------
     squares_um2_s : ndarray, shape (plants,)
         Integral of the squared error of every plant.
-    seconds : float
     """
 
     squares_um2_s: Array
@@ -75,8 +73,6 @@ class SetErrors:
 
     Parameters
     ----------
-    machine : Machine
-    dt_s : float
     stride : int
         Every `stride`-th sample is measured.
     """

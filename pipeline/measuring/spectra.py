@@ -7,13 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array
 from stillpath.models.machine import Machine
 from stillpath.models.schedule import resonances_hz
 from stillpath.pipeline.result import AxisSpectrum
 
 __all__ = ["BLOCK", "ErrorSpectra"]
-
-Array = NDArray[np.float64]
 
 BLOCK = 1024
 _KEPT = 64
@@ -31,8 +30,6 @@ class ErrorSpectra:
 
     Parameters
     ----------
-    machine : Machine
-    dt_s : float
     names : sequence of str
         Channels.
     """

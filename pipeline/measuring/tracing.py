@@ -8,11 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array
 from stillpath.pipeline.measuring.points import MeasuredPoints
 
 __all__ = ["Trace", "Tracer"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

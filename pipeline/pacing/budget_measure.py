@@ -72,7 +72,6 @@ class BudgetMeasurement(Measurement):
 
         Parameters
         ----------
-        written, sliced : MotionSamples
         classes : ndarray of int32, shape (len(written.moves),)
             Class that the errors of each of `written.moves` count for.
         """

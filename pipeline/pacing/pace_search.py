@@ -70,7 +70,6 @@ def search(trial: Trial, least: float, most: Factors, budget_um: float) -> PaceC
         Smallest factor, at most 1.
     most : dict
         Largest factor of every class.
-    budget_um : float
     """
     factors = dict.fromkeys(most, 1.0)
     tried = trial(factors)

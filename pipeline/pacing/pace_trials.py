@@ -68,8 +68,6 @@ class PaceTrials:
 
     Parameters
     ----------
-    samples : list of Sample
-    machine : Machine
     motion : callable
         Returns the motion of a sample at its new pace; raises `Unfit` where there is no command.
     """

@@ -44,13 +44,7 @@ class Sample:
 
 @dataclass(frozen=True, slots=True)
 class FileSamples:
-    """Samples of a file.
-
-    Attributes
-    ----------
-    samples : list of Sample
-    first_layer : FirstLayer
-    """
+    """Samples of a file."""
 
     samples: list[Sample]
     first_layer: FirstLayer
@@ -92,8 +86,6 @@ def take_samples(
     ----------
     source : BinaryIO
         At its beginning.
-    machine : Machine
-    dialect : Dialect
     progress : callable, optional
         Receives the bytes read so far.
     """

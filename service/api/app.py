@@ -95,7 +95,6 @@ def create_app(
 
     Parameters
     ----------
-    settings : Settings
     keys_required : bool
         Whether callers must show a key (`service.security.keys.keys_needed`).
     runner : callable

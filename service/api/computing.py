@@ -83,8 +83,6 @@ class ComputeRequest:
 
     Attributes
     ----------
-    machine : str
-        Its name.
     document : Machine, optional
         The machine, where the job needs it.
     revision : str
@@ -142,7 +140,6 @@ async def run_and_wait(request: Request, caller: Caller, asked: ComputeRequest) 
         Its body must have been read.
     caller : Caller
         Whose turn it is.
-    asked : ComputeRequest
 
     Raises
     ------

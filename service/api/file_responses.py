@@ -51,10 +51,6 @@ class Verified:
     """Compares results with the SHA-256 in their rows, again only where size or time have changed.
 
     Before anything is sent: that covers parts of files, and clients that look at no digest.
-
-    Parameters
-    ----------
-    storage : Storage
     """
 
     def __init__(self, storage: Storage) -> None:
@@ -114,9 +110,6 @@ async def stored(
     request : Request
         Its method and the headers Range, If-Range and If-None-Match are obeyed. Several ranges at
         once are answered with the whole, as RFC 9110 allows.
-    storage : Storage
-    key : str
-    media_type : str
     etag : str, optional
         Without quotes; by default of size and time.
     filename : str, optional

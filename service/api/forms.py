@@ -38,7 +38,6 @@ async def read_form(
 
     Parameters
     ----------
-    request : Request
     body : async iterable
         Its chunks.
     begin : callable

@@ -56,12 +56,7 @@ class _Channel:
 
 
 class Hub:
-    """Tells watchers how jobs stand.
-
-    Parameters
-    ----------
-    store : JobStore
-    """
+    """Tells watchers how jobs stand."""
 
     def __init__(self, store: JobStore) -> None:
         self._store = store
@@ -95,7 +90,6 @@ class Hub:
 
         Parameters
         ----------
-        job_id : str
         seen : str, optional
             Tag of the snapshot that the watcher knows already.
         """

@@ -70,13 +70,8 @@ class Intake:
 
     Parameters
     ----------
-    settings : Settings
-    store : JobStore
-    storage : Storage
-    machines : Resolver
     printers : mapping
         That results may be sent to, by name.
-    audit : AuditLog
     checker : Checker
         Compares a job's printer with its machine; what differs stands in the report.
     disk : Disk
@@ -135,11 +130,8 @@ class Intake:
 
         Parameters
         ----------
-        request : Request
         wanted : JobQuery
             A form may say `print` as well, as OctoPrint's does.
-        caller : Caller
-        idempotency_key : str, optional
 
         Raises
         ------
@@ -252,7 +244,6 @@ class Intake:
 
         Parameters
         ----------
-        job : Job
         files : mapping
             Of its storage's keys to local files, which are moved there.
 

@@ -43,7 +43,6 @@ class Limits:
 
     Parameters
     ----------
-    requests_per_minute : int
     uploads : int
         That one caller may have on their way at once.
     clock : callable
@@ -106,7 +105,6 @@ class Limits:
 
         Parameters
         ----------
-        caller : Caller
         body : BodyTimeout, optional
             With the sender of this upload.
 

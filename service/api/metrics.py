@@ -161,7 +161,6 @@ class Measured:
     Parameters
     ----------
     app : ASGI application
-    metrics : Metrics
     """
 
     def __init__(self, app: ASGIApp, *, metrics: Metrics) -> None:

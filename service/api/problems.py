@@ -39,8 +39,6 @@ class Problem(Exception):  # named as in RFC 9457
 
     Parameters
     ----------
-    status : int
-    title, detail : str
     headers : dict, optional
     **extra
         Further members of the document.

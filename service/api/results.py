@@ -38,12 +38,7 @@ router = APIRouter(prefix="/v1/jobs/{job_id}", tags=["results"])
 
 
 class Layers:
-    """Remembers where the tiles of the last prints lie; an output does not change once it is there.
-
-    Parameters
-    ----------
-    storage : Storage
-    """
+    """Remembers where the tiles of the last prints lie: an output never changes once written."""
 
     def __init__(self, storage: Storage) -> None:
         self._storage = storage

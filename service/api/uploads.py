@@ -44,8 +44,6 @@ class Upload:
     ----------
     name : str
         As its sender called the file, made safe.
-    size_bytes : int
-    sha256 : str
     fields : mapping
         The form's other parts.
     """
@@ -76,8 +74,6 @@ async def receive_upload(request: Request, target: Path, *, max_bytes: int, disk
     target : Path
         Is left incomplete when an error is raised; the caller deletes it. Nothing is synced:
         what stores the file for good does that.
-    max_bytes : int
-        Largest body.
     disk : Disk
         That `target` is on.
 
@@ -128,12 +124,10 @@ async def receive_files(
 
     Parameters
     ----------
-    request : Request
     folder : Path
         Is left as it is when an error is raised; the caller deletes it.
     max_bytes : int
         Of all together.
-    max_files : int
     disk : Disk
         That `folder` is on.
 

@@ -61,7 +61,6 @@ def back_up(data_dir: Path, target: Path) -> Manifest:
 
     Parameters
     ----------
-    data_dir : Path
     target : Path
         A new file; compressed if its name ends with ``gz``.
 

@@ -26,7 +26,6 @@ def open_documents(settings: Settings, engine: Engine, name: str) -> Documents:
 
     Parameters
     ----------
-    settings : Settings
     engine : sqlalchemy.Engine
         Of the same settings.
     name : {"machines", "identifications", "printers"}
@@ -46,7 +45,6 @@ class DocumentTable:
 
     Parameters
     ----------
-    engine : sqlalchemy.Engine
     root : str
         First part of all paths in the table.
     """

@@ -163,7 +163,6 @@ def migrate(engine: Engine, *, before_making: Callable[[], None] = lambda: None)
 
     Parameters
     ----------
-    engine : Engine
     before_making : callable
         Called where there are no tables; may raise to leave it at that.
 

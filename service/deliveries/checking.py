@@ -168,8 +168,6 @@ class Checker:
 
         Parameters
         ----------
-        printer : Printer
-        machine : Machine
         method : str
             Of the file; those without a stream need no raised limits.
         accept : bool

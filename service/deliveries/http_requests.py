@@ -55,7 +55,6 @@ def post(
 
     Parameters
     ----------
-    target : Target
     headers : mapping
     content : bytes, optional
         The body; or else a form of

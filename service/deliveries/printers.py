@@ -111,8 +111,6 @@ def upload(
 
     Parameters
     ----------
-    printer : Printer
-    file : Path
     name : str
         What the printer shall call it; one there of the same name is replaced.
     sha256 : str, optional

@@ -33,8 +33,6 @@ class Delivery:
 
     Attributes
     ----------
-    id : int
-    job_id : str
     kind : str
         ``webhook`` or ``printer``.
     target : str
@@ -110,7 +108,6 @@ def bring_forward(engine: Engine, *, waiting: Sequence[float], sending: float) -
 
     Parameters
     ----------
-    engine : Engine
     waiting : sequence of float
         After one attempt, two, ...; the last also after more.
     sending : float

@@ -48,7 +48,6 @@ class SendingTimes:
     ----------
     first_wait_s : float
         Before the second attempt; each further one waits three times as long.
-    attempts : int
     claim_s : float
         Time without a sign of life after which a sender counts as dead.
     poll_s : float
@@ -84,15 +83,10 @@ class Sender:
 
     Parameters
     ----------
-    engine : Engine
-    store : JobStore
-    storage : Storage
-    settings : Settings
     printers : mapping
         From `service.deliveries.printers.load_printers`.
     checker : Checker, optional
         Without one, printers are not looked at.
-    times : SendingTimes, optional
     """
 
     def __init__(

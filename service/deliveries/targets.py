@@ -48,7 +48,6 @@ class Target:
         ``http`` or ``https``.
     host : str
         In lower case, IPv6 without brackets.
-    port : int
     path : str
         With the query; begins with ``/``.
     """
@@ -130,7 +129,6 @@ def addresses_of(
 
     Parameters
     ----------
-    target : Target
     loopback : bool
         Whether this computer may be one of them; it may always if the target says so by name.
     resolve : callable

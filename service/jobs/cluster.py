@@ -75,13 +75,7 @@ class ClusterAway(RuntimeError):
 
 
 class Cluster:
-    """The workers of a service.
-
-    Parameters
-    ----------
-    settings : Settings
-    runner : Runner
-    """
+    """The workers of a service."""
 
     def __init__(self, settings: Settings, runner: Runner) -> None:
         self._settings = settings

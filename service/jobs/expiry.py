@@ -24,10 +24,6 @@ _NAME = "sweep"
 class Expiry:
     """The age of finished jobs and of idempotency keys.
 
-    Parameters
-    ----------
-    engine : sqlalchemy.Engine
-
     Notes
     -----
     Every method raises `service.database.engine.DatabaseAway` if the database does not answer.

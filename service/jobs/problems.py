@@ -35,8 +35,6 @@ def problem(status: int, title: str, detail: str, **extra: Any) -> dict[str, Any
 
     Parameters
     ----------
-    status : int
-        HTTP status.
     title : str
         The kind of problem, the same for every occurrence.
     detail : str

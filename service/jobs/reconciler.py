@@ -50,13 +50,6 @@ the service is not ready."""
 class Reconciler:
     """The reconciler thread.
 
-    Parameters
-    ----------
-    settings : Settings
-    store : JobStore
-    storage : Storage
-    cluster : Cluster
-
     Attributes
     ----------
     slots : int

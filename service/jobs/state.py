@@ -81,7 +81,6 @@ class Job:
 
     Attributes
     ----------
-    id : str
     kind : JobKind
         Compensations have an uploaded file and a report; other kinds only a result.
     owner : str
@@ -96,8 +95,6 @@ class Job:
         Digest of input, machine, options and version: equal jobs have the same result.
     priority : int
         Higher ones go first.
-    source_name, result_name : str
-        File names.
     source_bytes, source_sha256 : int, str
         Of the upload.
     output : str or None

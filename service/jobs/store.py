@@ -104,10 +104,8 @@ class JobStore:
 
         Parameters
         ----------
-        job : Job
         idempotency : (key, fingerprint), optional
             The caller's key, and a digest of the request that came with it.
-        limits : Quota, optional
         shared : bool
             Whether to reuse a job found by `find_same`.
         audit_row : mapping, optional

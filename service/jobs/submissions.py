@@ -58,7 +58,6 @@ class Quota:
 
         Parameters
         ----------
-        owner : str
         jobs, kept_bytes : int
             Current use of the owner; see `usage`.
         upload_bytes : int, optional

@@ -39,9 +39,6 @@ class Sweep:
 
     Parameters
     ----------
-    settings : Settings
-    store : JobStore
-    storage : Storage
     clock : callable
         Monotonic seconds.
     """

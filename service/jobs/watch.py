@@ -93,10 +93,6 @@ class Watch:
 
     Parameters
     ----------
-    store : JobStore
-    job : Job
-        The claimed job.
-    limits : Limits
     interrupted : callable
         Returns why this worker has to give its job back, or None.
     has_room : callable

@@ -18,8 +18,6 @@ class Work:
 
     Parameters
     ----------
-    settings : Settings
-    store : JobStore
     storage : Storage
         Store and storage are the caller's to close, after `stop`.
     runner : Runner

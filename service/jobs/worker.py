@@ -75,8 +75,6 @@ class Workplace:
     ----------
     scratch : Path
         Folder for temporary files.
-    name : str
-        Name of the worker.
     interrupted : callable
         Returns why the worker has to give its job back, or None.
     end : callable
@@ -97,7 +95,6 @@ def run_job(job_id: str, settings: dict[str, Any] | None, runner: str) -> None:
 
     Parameters
     ----------
-    job_id : str
     settings : dict, optional
         Fields of `Settings`; by default this process reads them from its environment.
     runner : str

@@ -61,12 +61,7 @@ class AuditEntry:
 
 
 class AuditLog:
-    """The audit log in the database.
-
-    Parameters
-    ----------
-    engine : Engine
-    """
+    """The audit log in the database."""
 
     def __init__(self, engine: Engine) -> None:
         self._engine = engine

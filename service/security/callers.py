@@ -24,7 +24,6 @@ class Caller:
     ----------
     owner : str
         Whose jobs they are.
-    scopes : frozenset of Scope
     key_id : str or None
         None: on this computer, without a key.
     remote : str or None

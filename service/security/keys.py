@@ -61,7 +61,6 @@ class Key:
         Whose jobs its jobs are; several keys may have one owner.
     name : str
         What it is for, for a person.
-    scopes : frozenset of Scope
     created_at, expires_at, revoked_at, used_at : float or None
         Seconds since the epoch; `used_at` may be a minute behind.
     """
@@ -96,7 +95,6 @@ class KeyStore:
 
     Parameters
     ----------
-    engine : Engine
     clock : callable
         Seconds since the epoch.
     """
@@ -246,8 +244,6 @@ def announce_first_key(store: KeyStore, given: SecretStr | None, folder: Path) -
 
     Parameters
     ----------
-    store : KeyStore
-    given : SecretStr, optional
     folder : Path
         For the file ``first-key``, which only its owner reads.
 

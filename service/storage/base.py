@@ -22,8 +22,6 @@ class Stat:
 
     Attributes
     ----------
-    key : str
-    size_bytes : int
     modified_at : float
         Seconds since the epoch.
     """
@@ -35,12 +33,7 @@ class Stat:
 
 @dataclass(frozen=True, slots=True)
 class Room:
-    """Free and total space of a storage's disk.
-
-    Attributes
-    ----------
-    free_bytes, total_bytes : int
-    """
+    """Free and total space of a storage's disk."""
 
     free_bytes: int
     total_bytes: int

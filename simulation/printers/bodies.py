@@ -14,11 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
+from stillpath.models.arrays import Array
 from stillpath.simulation.printers._kernels import followed
 
 __all__ = ["Bodies", "Element", "Friction", "Motion"]
-
-Array = NDArray[np.float64]
 
 STEP_S = 1e-4
 """Commands are linear over a step, and friction is held: a tenth of the period of 1 kHz."""

@@ -12,11 +12,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array
 from stillpath.simulation.printers.bodies import STEP_S, Bodies, Element, Friction, Motion
 
 __all__ = ["Axis", "CoreXY", "Frame", "Mount", "Printer", "bed_slinger", "corexy"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,16 +9,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array
 from stillpath.models.identification.excitation import klipper_psd, regenerate
 from stillpath.models.identification.types import Excitation
 from stillpath.simulation.printers.bodies import STEP_S, Bodies, Element
 from stillpath.simulation.printers.machines import Printer
 
 __all__ = ["NEW_TEST", "OLD_TEST", "Accelerometer", "Record", "drawn_sensor", "run_test"]
-
-Array = NDArray[np.float64]
 
 OLD_TEST = Excitation((1.0, 0.0), 5.0, 133.33, 75.0, 1.0, 0.0)
 NEW_TEST = Excitation((1.0, 0.0))
@@ -35,7 +33,6 @@ class Accelerometer:
 
     Attributes
     ----------
-    rate_hz, step_mm_s2, noise_mm_s2 : float
     gains : tuple of float
         Of its three axes.
     turn_rad : tuple of float

@@ -15,9 +15,17 @@ from stillpath.compensation._least_squares_kernels import (
     forward,
     weighted_gram,
 )
+from stillpath.compensation._window_kernels import tied_window
 from stillpath.compensation.lifted_window import lifted_window
 from stillpath.compensation.preview import PreviewDesign, running_gram
-from stillpath.compensation.window_problem import EFFORT_PRICE, Bounds, Extremes, solve_window
+from stillpath.compensation.window_problem import (
+    EFFORT_PRICE,
+    Bounds,
+    Extremes,
+    functions_of,
+    refusing_singular,
+    within_bounds,
+)
 from stillpath.models.plants import Mode, ModesSpec, discretise
 
 DT_S = 1e-3
@@ -35,10 +43,20 @@ def design(request: pytest.FixtureRequest) -> PreviewDesign:
     return PreviewDesign(lifted, 24, price=0.1)
 
 
-def solve(design: PreviewDesign, z: np.ndarray, path: np.ndarray, *rest: object) -> np.ndarray:
+def solve(
+    design: PreviewDesign,
+    z: np.ndarray,
+    path: np.ndarray,
+    weight: np.ndarray,
+    rests: np.ndarray,
+    bounds: Bounds,
+) -> np.ndarray:
     # A part of an array, as where a whole piece is solved: no kernel is compiled for this alone.
     targets = np.repeat(design.lifted.target[:, None] * path, 2, axis=1)[:, ::2]
-    return solve_window(design, z, path, targets, *rest)
+    functions = functions_of(design, at_rests=len(rests) > 0)
+    with refusing_singular():
+        tied = tied_window(functions, z, path, targets, weight, rests, bounds.limits())
+    return tied.command if tied.kept else within_bounds(functions, tied, z, path, bounds)
 
 
 def corner() -> np.ndarray:

@@ -289,8 +289,8 @@ def test_marks(golden_machine: Machine) -> None:
         *["Perimeter"] * 3,
     ]
     assert block.moves.object_id.tolist() == [0, -1, -1, -1, 1]
-    assert interpreter.object_names == ["A id:0 copy 0", "B C"]
-    assert interpreter.layer_z_mm[:2] == [0.3, 0.5]
+    assert interpreter.state.objects.names == ["A id:0 copy 0", "B C"]
+    assert interpreter.state.tables.layer_z[:2].tolist() == [0.3, 0.5]
 
 
 @pytest.mark.parametrize(

@@ -241,11 +241,3 @@ def emit(
         index[m] = int(row[Q_INDEX])
         t_s += times[1, m] + times[2, m] + times[3, m]
     return t_s
-
-
-@kernel(allocates=False)
-def drop(queue: Any, settled: int, count: int) -> None:
-    """Move the unsettled rows to the front."""
-    for m in range(settled, count):
-        for k in range(Q_SIZE):
-            queue[m - settled, k] = queue[m, k]

@@ -59,8 +59,6 @@ def stream_limits(
 
     Parameters
     ----------
-    command : CommandLimits
-        Limits of the motors.
     mesh_slope : float
         Largest slope of the bed mesh. Klipper adds the mesh's Z to every move and then caps it by
         the limits of Z (klippy/extras/bed_mesh.py, kinematics/cartesian.py, 2026-08). Those limits
@@ -81,14 +79,7 @@ def stream_limits(
 
 
 class KlipperEncoder:
-    """Encode pieces for one machine.
-
-    Parameters
-    ----------
-    firmware : Klipper
-    limits : KlipperLimits
-        Limits of the stream.
-    """
+    """Encode pieces for one machine."""
 
     grid_mm = _GRID / UNITS_PER_MM
 

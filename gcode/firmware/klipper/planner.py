@@ -87,8 +87,7 @@ class Planner(QueuePlanner):
             speeds,
             phases.move_index,
         )
-        kernels.drop(self._queue, settled, self._count)
-        self._count -= settled
+        self._drop(settled)
         self._retry = 2 * self._count
         return with_motion(phases, times, speeds)
 

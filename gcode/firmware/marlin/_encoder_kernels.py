@@ -9,11 +9,10 @@ from numpy.typing import NDArray
 
 from stillpath.gcode.firmware._vertex_kernels import hop
 from stillpath.gcode.firmware._writing_kernels import printed_feedrate
+from stillpath.models.arrays import Array
 from stillpath.models.jit import kernel
 
 __all__ = ["Blocks", "assign_rates", "bend_reversals", "spread_advance", "thin"]
-
-Array = NDArray[np.float64]
 
 RUSH, RUSH_MM_S = 1.25, 10.0
 """Largest speed of a segment, as a factor of its planned one plus a constant: lost time is made up
@@ -227,7 +226,6 @@ def assign_rates(
 
     Parameters
     ----------
-    blocks : Blocks
     foreign_s : ndarray, shape (n,)
         How long moves that are not ours take.
     correction_s : ndarray, shape (n,)
@@ -238,7 +236,6 @@ def assign_rates(
         Of the step timer.
     least_hz : float
         Lowest step rate; the difference to slower motion or standstill is carried over too.
-    start_s : float
     feedrate, predicted_s : ndarray, shape (n,)
         Filled.
     """

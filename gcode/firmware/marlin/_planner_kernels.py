@@ -38,7 +38,6 @@ from stillpath.gcode.firmware.marlin._block_kernels import (
     Q_PATH,
     Q_RATE,
     Q_REACH2,
-    Q_SIZE,
     Q_SPEED,
     Q_START,
     Q_STEPS,
@@ -47,7 +46,7 @@ from stillpath.gcode.firmware.marlin._block_kernels import (
 )
 from stillpath.models.jit import kernel
 
-__all__ = ["drop", "emit", "settle"]
+__all__ = ["emit", "settle"]
 
 _FEW = 12  # steps that are always counted one by one
 _FEW_CURVED = 100.0  # the same of ramps along curves; longer ones take the time of straight ones
@@ -451,11 +450,3 @@ def _fit(
     shape[4] = duration if final > first else 0.0
     shape[5] = 0.0
     shape[6] = 0.0 if final > first else duration
-
-
-@kernel
-def drop(queue: Any, settled: int, count: int) -> None:
-    """Move the unsettled rows to the front."""
-    for m in range(settled, count):
-        for k in range(Q_SIZE):
-            queue[m - settled, k] = queue[m, k]

@@ -41,12 +41,8 @@ def climb_in_long_moves(
     ----------
     segments : Segments
         Those that are to be written, with X and Y on whole steps.
-    timeline : Timeline
     per_mm : float
         Steps of Z.
-    limits : MarlinLimits
-        Limits of the segments.
-    classic_jerk : bool
 
     Returns
     -------

@@ -243,7 +243,6 @@ def unheeded(kind: EventKind, why: str, *, origin: bool = True) -> Handler:
 
     Parameters
     ----------
-    kind : EventKind
     why : str
         What a person is told.
     origin : bool

@@ -131,11 +131,6 @@ class MarlinEncoder:
 
     Parameters
     ----------
-    firmware : Marlin
-    command : CommandLimits
-        Limits of the motors.
-    corexy : bool
-    mesh_slope : float
     travel_mm : sequence of (float, float), optional
         Least and largest X, and Y.
     """

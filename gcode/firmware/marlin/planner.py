@@ -103,8 +103,7 @@ class Planner(QueuePlanner):
             speeds,
             phases.move_index,
         )
-        kernels.drop(self._queue, settled, self._count)
-        self._count -= settled
+        self._drop(settled)
         phases.s_curve[:] = self._s_curve
         return with_motion(phases, times, speeds)
 

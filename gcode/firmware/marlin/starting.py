@@ -52,14 +52,10 @@ class StreamLevels:
 
     Parameters
     ----------
-    moves : Interleaved
-    stream : MarlinLimits
-    command : CommandLimits
     least_hz : float
         The least step rate, which a start from rest begins with.
     ahead : int
         Number of lines in the firmware's queue when one begins, including that one.
-    corexy : bool
 
     Attributes
     ----------

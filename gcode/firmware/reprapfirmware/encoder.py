@@ -118,7 +118,6 @@ class RepRapEncoder:
 
     Parameters
     ----------
-    firmware : RepRapFirmware
     kinematics : {"cartesian", "corexy"}
     limits : RepRapLimits
         What the stream runs under.

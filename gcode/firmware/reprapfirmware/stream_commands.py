@@ -29,7 +29,6 @@ class RepRapStreamCommands:
 
     Parameters
     ----------
-    firmware : RepRapFirmware
     pressure_advance_s : float
         The machine's M572 S: the stream's filament holds it already, so the firmware's is off
         together with the shaper.

@@ -200,7 +200,6 @@ class ByCommand:
 
     Parameters
     ----------
-    entry : Entry
     command : str
         Of the program; options may follow.
     tell : callable

@@ -36,8 +36,6 @@ class OctoPrintHost(Host):
     ----------
     plugin : object
         Our plugin, with what OctoPrint gave it.
-    ledger : Ledger
-    reports : Reports
     show : callable
         Is told when something has changed that people see.
     """

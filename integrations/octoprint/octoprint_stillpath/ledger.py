@@ -27,7 +27,6 @@ class Entry:
     ----------
     path : str
         Of the original in OctoPrint's storage `local`.
-    machine : str
     options : dict
         Of the job.
     where : str

@@ -71,11 +71,8 @@ class Worker:
 
     Parameters
     ----------
-    ledger : Ledger
-    host : Host
     folder : Path
         For what lives as long as a job; it is emptied at the start.
-    logger : Logger
     """
 
     def __init__(self, ledger: Ledger, host: Host, folder: Path, logger: Logger) -> None:

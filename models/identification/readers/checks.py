@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.readers.tables import Table
 
 __all__ = ["check_alive", "check_long", "check_range", "check_rising", "check_steady"]
-
-Array = NDArray[np.float64]
 
 _RATES_HZ = (10.0, 1e6)
 _LONGEST_S = 3600.0

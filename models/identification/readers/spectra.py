@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.readers.checks import check_alive, check_long, check_rising
 from stillpath.models.identification.readers.settings import ReadSettings
@@ -14,8 +14,6 @@ from stillpath.models.identification.readers.tables import Table
 from stillpath.models.identification.types import Spectrum
 
 __all__ = ["MOST_BINS", "is_spectrum", "read_spectrum"]
-
-Array = NDArray[np.float64]
 
 MOST_BINS = 2000
 _LEAST_BINS = 16

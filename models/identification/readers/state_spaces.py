@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stillpath.models.arrays import Complex
 from stillpath.models.errors import ModelError
 from stillpath.models.realisation import transmission_zeros
 from stillpath.models.roots import dc_gain
@@ -14,7 +15,6 @@ from stillpath.models.roots import dc_gain
 __all__ = ["zeros_poles_gain"]
 
 Matrix = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 _LARGEST_ORDER = 40
 _LARGEST_ERROR = 1e-3
@@ -32,7 +32,6 @@ def zeros_poles_gain(
     Parameters
     ----------
     a, b, c : ndarray, shapes (n, n), (n,), (n,)
-    d : float
     dt_s : float or None
         None: continuous.
 

@@ -9,11 +9,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
 
 __all__ = ["MOST_ROWS", "Table", "as_table", "check_size"]
-
-Array = NDArray[np.float64]
 
 MOST_ROWS = 1_000_000
 """A test of 135 s with a sensor of 6.6 kHz has 900 000 samples; most have half as many."""

@@ -20,7 +20,7 @@ from stillpath.compensation.feedback.disturbance_observer import (
     observer_sensitivity,
 )
 from stillpath.compensation.feedback.pd import inertia_pd, loop_margins, margins
-from stillpath.compensation.feedback.zero_phase import design_prefilter, fir_within, reference_plant
+from stillpath.compensation.feedback.zero_phase import design_prefilter, reference_plant
 from stillpath.models.diagrams import Diagram, polynomial_response
 from stillpath.models.loops import Loop, load_loop
 from stillpath.simulation.closed_loop import Imperfections, simulate
@@ -154,14 +154,6 @@ class TestPrefilter:
     def test_reference_plant(self) -> None:
         ours = reference_plant(TABLE).frequency_response(F_HZ[::100])
         assert ours == pytest.approx(TABLE.tracking(F_HZ[::100]), abs=1e-9)
-
-    def test_cutoff_from_the_acceleration(self) -> None:
-        y_d = there_and_back()
-        limit = 1.5 * 31_250.0
-        made = fir_within(TABLE, y_d, limit, length=40)
-        assert np.abs(np.diff(made.apply(y_d), 2)).max() / DT**2 <= limit
-        with pytest.raises(DesignError, match="longer low-pass"):
-            fir_within(TABLE, y_d, 10.0)
 
     def test_coefficients_are_the_filter(self) -> None:
         made = design_prefilter(TABLE, cutoff_hz=500.0)
