@@ -15,6 +15,7 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from unittest.mock import patch
 
 import numpy as np
@@ -23,10 +24,10 @@ from scipy.optimize import linprog
 
 from stillpath.gcode._segment_kernels import path_directions
 from stillpath.gcode.segments import (
+    ACROSS_SHARE,
     ALONG_SHARE,
     ErrorFilter,
     Segments,
-    across_tolerance_mm,
     fit_segments,
 )
 from stillpath.gcode.timeline import Timeline
@@ -83,16 +84,10 @@ def stretches(file: Path, machine: str, target: Path) -> Iterator[Stretch]:
         command_mm: Array,
         tolerance_mm: float,
         error_filter: ErrorFilter,
-        *,
-        step_mm_s: float,
-        grid_mm: float,
+        **others: Any,
     ) -> Segments:
-        fitted = fit_segments(
-            timeline, command_mm, tolerance_mm, error_filter, step_mm_s=step_mm_s, grid_mm=grid_mm
-        )
-        used = error_filter.share * np.array(
-            [ALONG_SHARE * tolerance_mm, across_tolerance_mm(tolerance_mm)]
-        )
+        fitted = fit_segments(timeline, command_mm, tolerance_mm, error_filter, **others)
+        used = error_filter.share * tolerance_mm * np.array([ALONG_SHARE, ACROSS_SHARE])
         found.extend(_beginnings(timeline, command_mm[:2], fitted, used))
         return fitted
 

@@ -155,6 +155,7 @@ def _figure(
     note: str,
     y_title: str,
     *lines: Line,
+    log: bool = True,
 ) -> _Figure:
     """Return a figure over the number of functions n, with the chosen one marked."""
 
@@ -168,7 +169,7 @@ def _figure(
         y_title=y_title,
         lines=lines,
         tick=tick,
-        log=True,
+        log=log,
         marks=[Mark(summary.rung.n, f"n {summary.rung.n} taken")] if summary.rung else [],
     )
     columns = [f"{y_title.split(',')[0]} {line.name}".strip() for line in lines]

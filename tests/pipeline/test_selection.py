@@ -154,8 +154,8 @@ def test_a_file_that_must_not_be_large(gear: Path, written: Written, tmp_path: P
         assert found.settings["tolerance_um"] == tolerance_um
         assert found.written_bytes == target.stat().st_size <= 1e6 * limit_mb
     target.write_bytes(b"precious")
-    with pytest.raises(GcodeError, match=r"exceeds max_mb 0\.2"):
-        run(gear, target, machine, max_mb=0.2)
+    with pytest.raises(GcodeError, match=r"exceeds max_mb 0\.1"):
+        run(gear, target, machine, max_mb=0.1)
     assert target.read_bytes() == b"precious"
     assert [p.name for p in tmp_path.iterdir()] == ["out.gcode"]
 
