@@ -131,7 +131,7 @@ class CompensationOptions:
         float | None,
         typer.Option(
             help="How far the written path may be from the computed one; less where the "
-            "machine is known well. [default: 4]"
+            "machine is known well. [default: 2.5]"
         ),
     ] = None
     where: Annotated[
@@ -146,7 +146,7 @@ class CompensationOptions:
         typer.Option(
             metavar="MB",
             help="The most that the written G-code may have: compensate what is visible, then less "
-            "exactly (tolerances of 8 to 24), then walls alone, until it fits.",
+            "exactly (tolerances of 8, 12 and 16), then walls alone, until it fits.",
         ),
     ] = None
     budget_um: BudgetOption = None

@@ -69,10 +69,9 @@ _UNSEEN_SHARE = 0.85
 _PRICE = 0.5
 """Weight, in the ranking, of the worst member's error in excess of the shaper's. Members contradict
 each other: fully protecting the least likely one would mean not compensating the others."""
-_COARSE_UM, LEAST_FIT = 4.0, 0.25
+_COARSE_UM, _LEAST_FIT = 4.0, 0.5
 """Contour error from which segments may use their full tolerance, and the least share of it below:
-on a well-known machine the segments would otherwise be the larger error. With these and the default
-tolerance they add about a hundredth to the error."""
+on a well-known machine the segments would otherwise be the larger error."""
 _STRIDE = 5
 _NO_RESTS = np.zeros((0, 2), np.int64)
 
@@ -110,8 +109,8 @@ class Choice:
         A shaper's command has more edges: fitted to 2 µm it leaves up to 1.2 times its error.
         """
         if not any(self.shares):
-            return LEAST_FIT
-        return float(np.clip(self.rms_um / _COARSE_UM, LEAST_FIT, 1.0))
+            return _LEAST_FIT
+        return float(np.clip(self.rms_um / _COARSE_UM, _LEAST_FIT, 1.0))
 
     def ranged(self, channels: Sequence[Channel], *, steps: bool) -> list[Channel]:
         """Return the channels of a report with the range over the members."""

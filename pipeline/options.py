@@ -101,7 +101,7 @@ class Options(BaseModel):
         default=None, ge=1, le=10_000, description="Which plate of a 3MF package with several."
     )
     tolerance_um: float = Field(
-        default=4.0,
+        default=2.5,
         ge=0.5,
         le=50,
         allow_inf_nan=False,
@@ -128,7 +128,7 @@ class Options(BaseModel):
     max_mb: MaxMb | None = Field(
         default=None,
         description="The most that the G-code may have, in millions of bytes: what is visible is "
-        "compensated, then less exactly (tolerances of 8 to 24 um), then outer walls alone, "
+        "compensated, then less exactly (tolerances of 8, 12 and 16), then outer walls alone, "
         "until it fits.",
     )
     compare_live: bool = Field(

@@ -48,8 +48,6 @@ _REST_TOLERANCE_S = 5e-3
 _ROUNDS = 2
 _STEP_SHARE = 0.5
 """Share of what motors bear by which the speed steps from segment to segment."""
-_UNKNOWN_FIT = 0.5
-"""Share of the tolerance that is used where no set says how well the machine is known."""
 _COARSE_MM, _COARSE_GRID_MM = 5e-3, 1e-3
 """Tolerance from which three decimals do: files are 5 % smaller."""
 _ACCEL_SHARES = (1.0, 0.8, 0.6, 0.5)
@@ -110,7 +108,7 @@ class PieceCompensator:
     ) -> None:
         self._machine = machine
         self.compensator = _designed(machine, options, shaper, caution)
-        fit_share = _UNKNOWN_FIT if caution is None else caution.fit_share
+        fit_share = 1.0 if caution is None else caution.fit_share
         self._tolerance_mm = 1e-3 * options.tolerance_um * fit_share
         firmware = adapter(machine)
         self.encoder = firmware.encoder()

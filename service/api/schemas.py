@@ -40,7 +40,7 @@ _EXAMPLE: dict[str, Any] = {
         "robust": "auto",
         "along": None,
         "plate": None,
-        "tolerance_um": 4.0,
+        "tolerance_um": 2.5,
         "times": "new",
         "dialect": None,
     },

@@ -56,7 +56,7 @@ DEFAULTS: dict[str, Any] = {
     "machine": "",
     "method": "fbf",
     "robust": "auto",
-    "tolerance_um": 4.0,
+    "tolerance_um": 2.5,
     "budget_um": "",
     "times": "new",
     "automatic": True,
