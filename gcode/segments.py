@@ -27,8 +27,11 @@ from stillpath.models.plants import DiscretePlant
 __all__ = ["ErrorFilter", "Segments", "fit_segments"]
 
 ALONG_SHARE, ACROSS_SHARE = 0.8, 0.5
+"""Shares of the tolerance along the path and across it."""
 LOOSE_SHARE = 0.15
+"""By how much more an end may miss the command, so that it need not be moved to reach it."""
 FULL_GAIN = 5.0
+"""Gain of a resonance up to which all of the tolerance is used."""
 BEYOND_MODEL = 0.5
 """Added to a machine's response to an error. A model ends with its band, a machine does not: all of
 the error would otherwise be moved to frequencies at which the machine is unknown."""
@@ -136,7 +139,7 @@ def fit_segments(
     command_mm : ndarray, shape (4, n)
         Command on the timeline's grid: x y compensated, z e as planned.
     tolerance_mm : float
-        Largest distance in X Y between command and fit.
+        Largest distance in X Y between command and fit, before its ends are moved.
     error_filter : ErrorFilter
         The machine's response to the error.
     step_mm_s : float
@@ -236,20 +239,14 @@ class _Fit:
             return
         place = self._command_mm[:2, knot]
         shift = np.empty((2, len(inner)))
+        above = reach(knot, _LAGS)
         for axis, cost in enumerate(self._filter.costs):
-            above = reach(knot, len(cost.correlation))
             band = np.zeros((above + 1, len(inner)))
             command, (error, felt) = self._command_mm[axis], self._scratch
             normal_equations(command, knot, cost, error, felt, band, shift[axis])
             shift[axis] = solveh_banded(band, shift[axis], overwrite_ab=True, check_finite=False)
         end_mm[:2, :-1] = self._grid_mm * np.round((place[:, 1:-1] + shift) / self._grid_mm)
-        # Filament per mm stays as it was: Klipper brakes where it changes.
-        step = np.diff(place, axis=1)
-        length = np.maximum(np.hypot(*step), 1e-9)
-        feed = np.diff(end_mm[3], prepend=begin[3]) / length
-        even = np.minimum(np.abs(feed[1:]), np.abs(feed[:-1])) * np.sign(feed[1:])
-        along = np.sum(shift * step[:, 1:], axis=0) / length[1:]
-        end_mm[3, :-1] += np.where(feed[1:] * feed[:-1] > 0.0, even * along, 0.0)
+        end_mm[3, :-1] += _filament(place, np.append(begin[3], end_mm[3]), shift)
 
     def segments(self) -> Segments:
         """Return the fitted segments."""
@@ -258,6 +255,24 @@ class _Fit:
         return Segments(
             end_s, self._end_mm[:, rows].copy(), self._groups[rows].copy(), self._filter
         )
+
+
+def _filament(
+    place: NDArray[np.float64], e: NDArray[np.float64], shift: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Filament that inner ends of segments take along, so that its amount per mm stays.
+
+    Firmwares brake where it changes. `place` (2, n) and `e` (n,) are those of all ends with the
+    beginning, `shift` (2, n - 2) says how far the inner ones move.
+    """
+    step = np.diff(place, axis=1)
+    length = np.maximum(np.hypot(*step), 1e-9)
+    per_mm = np.diff(e) / length
+    before, after = per_mm[:-1], per_mm[1:]
+    # Where a line begins or ends, or filament turns back, none.
+    least = np.where(before * after > 0.0, np.minimum(np.abs(before), np.abs(after)), 0.0)
+    along = np.sum(shift * step[:, 1:], axis=0) / length[1:]
+    return np.asarray(np.sign(after) * least * along)
 
 
 def _merge_crawl(

@@ -21,7 +21,7 @@ _WALLS = frozenset({Feature.OUTER_WALL, Feature.OVERHANG_WALL, Feature.THIN_WALL
 _VISIBLE = _WALLS | {Feature.TOP_SURFACE, Feature.SKIN, Feature.IRONING, Feature.BOTTOM_SURFACE}
 _CHOSEN = {"visible": _VISIBLE, "walls": _WALLS}
 _TOLERANCES_UM = (8.0, 12.0, 16.0)
-"""Tried in turn where a file is too large; larger ones lose as much as leaving out surfaces does."""
+"""Tried in turn where a file is too large; larger ones cost as much as leaving out surfaces."""
 _WORTH_S = 0.5
 """Shorter stretches are not worth the lines that end a stream and begin the next one."""
 
