@@ -131,7 +131,7 @@ class CompensationOptions:
         float | None,
         typer.Option(
             help="How far the written path may be from the computed one; less where the "
-            "machine is known well. [default: 2.5]"
+            "machine is known well. [default: 2]"
         ),
     ] = None
     where: Annotated[

@@ -101,7 +101,7 @@ class Options(BaseModel):
         default=None, ge=1, le=10_000, description="Which plate of a 3MF package with several."
     )
     tolerance_um: float = Field(
-        default=2.5,
+        default=2.0,
         ge=0.5,
         le=50,
         allow_inf_nan=False,

@@ -116,7 +116,7 @@ _SETTINGS: dict[str, dict[str, Any]] = {
         "description": "How far the written path may be from the computed one.",
         "unit": "\u00b5m",
         "type": "float",
-        "default_value": 2.5,
+        "default_value": 2.0,
         "minimum_value": "0.5",
         "maximum_value": "50",
     },

@@ -40,7 +40,7 @@ _EXAMPLE: dict[str, Any] = {
         "robust": "auto",
         "along": None,
         "plate": None,
-        "tolerance_um": 2.5,
+        "tolerance_um": 2.0,
         "times": "new",
         "dialect": None,
     },

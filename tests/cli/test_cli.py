@@ -86,7 +86,7 @@ def test_compensate_writes_file_report_and_table(pipeline, source, tmp_path, cap
     assert (pipeline.machine, pipeline.options.method, pipeline.options.tolerance_um) == (
         "ender3",
         "fbf",
-        2.5,
+        2.0,
     )
     shown = capsys.readouterr().out
     assert "contour rms, extruding" in shown

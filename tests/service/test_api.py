@@ -74,7 +74,7 @@ def test_a_job_from_upload_to_deletion(client: TestClient, data_dir: Path):
         "robust": "auto",
         "along": None,
         "plate": None,
-        "tolerance_um": 2.5,
+        "tolerance_um": 2.0,
         "times": "new",
         "dialect": None,
     }

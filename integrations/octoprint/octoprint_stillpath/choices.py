@@ -56,7 +56,7 @@ DEFAULTS: dict[str, Any] = {
     "machine": "",
     "method": "fbf",
     "robust": "auto",
-    "tolerance_um": 2.5,
+    "tolerance_um": 2.0,
     "budget_um": "",
     "times": "new",
     "automatic": True,

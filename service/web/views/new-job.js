@@ -48,7 +48,7 @@ export async function show({ main, signal, setTitle }) {
   };
   const way = wayToPrint(() => ready());
   const method = select("method", METHODS);
-  const tolerance = h("input", { type: "number", id: "tolerance", name: "tolerance_um", min: "0.5", max: "50", step: "0.5", value: "2.5", required: true });
+  const tolerance = h("input", { type: "number", id: "tolerance", name: "tolerance_um", min: "0.5", max: "50", step: "0.5", value: "2", required: true });
   const options = moreOptions();
   const written = [field("method", "Method", method),
     field("tolerance", "Tolerance, µm", tolerance, "How far the written path may be from the computed one.")];
