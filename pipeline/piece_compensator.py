@@ -47,7 +47,7 @@ DT_S = 1e-3
 _REST_TOLERANCE_S = 5e-3
 _ROUNDS = 2
 _STEP_SHARE = 0.3
-"""Share of what motors bear by which the speed steps from segment to segment; M220 may double it."""
+"""Share of what motors bear by which speeds step from segment to segment: M220 may double it."""
 _COARSE_MM, _COARSE_GRID_MM = 5e-3, 1e-3
 """Tolerance from which three decimals do: files are 5 % smaller."""
 _ACCEL_SHARES = (1.0, 0.8, 0.6, 0.5)
