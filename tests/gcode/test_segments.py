@@ -1,4 +1,4 @@
-"""The segment fit: its bounds, its ends, and what noise shaping buys."""
+"""The segment fit: its bounds, its ends, and what a machine makes of its error."""
 
 from __future__ import annotations
 
