@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import typer
 
-from stillpath.cli.arguments import KeyOption, ServerOption
+from stillpath.cli.arguments import KeyOption, Refused, ServerOption
 
 if TYPE_CHECKING:
     from stillpath.pipeline.options import Options
@@ -140,6 +140,8 @@ def fetch(
     with interruptible_at_once(), _client(server, key) as client:
         found = client.job(job)
         target = output or Path(safe_name(found.result_name))
+        if output is None and target.exists():
+            raise Refused(f"{target} exists; name the file with -o to replace it")
         with _progress() as tell:
             client.fetch(found, target, tell=tell)
             if report is not None:

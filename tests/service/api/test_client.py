@@ -388,7 +388,11 @@ def test_proxies_that_are_none_are_named(proxy: str, monkeypatch: pytest.MonkeyP
 
 
 def test_the_commands_of_jobs(
-    address: str, client: Client, run: Callable[..., Any], tmp_path: Path
+    address: str,
+    client: Client,
+    run: Callable[..., Any],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ):
     made = client.submit(part(tmp_path, "G1 X41\n"), machine="ender3", batch="cli")
     there = partial(run, server=address)
@@ -400,6 +404,11 @@ def test_the_commands_of_jobs(
     target = tmp_path / "got.gcode"
     assert there("jobs", "fetch", made.id, "-o", target)[:2] == (0, f"{target}\n")
     assert target.read_text() == "; compensated\nG1 X41\n"
+    monkeypatch.chdir(tmp_path)
+    code, named, _ = there("jobs", "fetch", made.id)
+    assert (code, Path(named.strip()).read_bytes()) == (0, target.read_bytes())
+    code, _, err = there("jobs", "fetch", made.id)
+    assert (code, "-o" in err) == (2, True)
     code, _, err = there("jobs", "cancel", made.id)
     assert (code, "nothing to cancel" in err) == (2, True)
     assert there("jobs", "delete", made.id)[0] == 0
