@@ -269,7 +269,7 @@ class PreviewAxis:
         self._states = np.zeros(sum(p.order for p in self._plants))
 
     def observe(self, command: Array) -> None:
-        """Account for a command (n,) made elsewhere, up to the sample after its last."""
+        """Account for a command (n,) made elsewhere; what follows begins a sample after its last."""
         if len(command) == 0:
             return
         origin = float(command[-1])
@@ -294,8 +294,12 @@ class PreviewAxis:
         self._made = None
 
     def commit_as(self, command: Array) -> None:
-        """Mark a command (n,) derived from the last one as executed."""
-        self.observe(command)
+        """Mark a command (n,) derived from the last one as executed.
+
+        Unlike what is observed, a piece shares its last sample with what follows.
+        """
+        self.observe(command[:-1])
+        self._move_origin(float(command[-1]))
         self.rung = self.next_rung
         self._made = None
 

@@ -49,7 +49,10 @@ def test_the_ends_are_those_of_the_two() -> None:
 
 
 def test_the_machine_follows_the_mixture() -> None:
-    """What comes after a piece is that of a machine which saw the mixture, not its parts."""
+    """What comes after a piece is that of a machine which saw the mixture, not its parts.
+
+    The last sample of a piece is the first one of what follows.
+    """
     path, extruding = short()
     first, second = path[:, :1500], path[:, 1500:3000]
     committed = compensator("fbf", MACHINE, DT_S, robust="ensemble", caution=caution(0.6, 0.6))
@@ -62,9 +65,26 @@ def test_the_machine_follows_the_mixture() -> None:
     observed.compensate(first, extruding[:1500], NO_RESTS)
     observed.commit()
     observed.reset(first[:, 0])
-    observed.observe(command)
+    observed.observe(command[:, :-1])
     rest = [one.compensate(second, extruding[1500:3000], NO_RESTS) for one in (committed, observed)]
     np.testing.assert_allclose(rest[0], rest[1], atol=1e-9)
+
+
+def test_a_whole_share_leaves_the_machine_as_its_own_design_does() -> None:
+    """A piece begins with the last sample of the one before, whoever made that command."""
+    ease = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, 400))
+    there = np.outer([20.0, 8.0], ease)
+    pieces = [there, there[:, ::-1]]
+    mixed = compensator("fbf", MACHINE, DT_S, robust="ensemble", caution=caution(1.0, 1.0))
+    alone = compensator("fbf", MACHINE, DT_S, robust="ensemble")
+    made = []
+    for one in (mixed, alone):
+        one.reset(there[:, 0])
+        for piece in pieces:
+            last = one.compensate(piece, np.ones(400, bool), NO_RESTS)
+            one.commit()
+        made.append(last)
+    np.testing.assert_allclose(*made, atol=1e-6)
 
 
 def test_shares_are_shares() -> None:
