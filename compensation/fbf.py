@@ -143,11 +143,11 @@ class PreviewFbf:
         self.rungs: tuple[int, ...] = ()
         # Delays are not vibration: leading the path by them would help only if they were exact.
         sets = [plant_set(machine.axes[axis].without_delay(), dt_s) for axis in ("x", "y")]
-        chosen = _chosen(sets, robust, dt_s, window, update, basis, along)
-        bands_hz = [machine.axes["x"].band_hz, machine.axes["y"].band_hz]
+        most = tuple(functions_within(machine.axes[axis].band_hz, dt_s) for axis in ("x", "y"))
+        chosen = _chosen(sets, robust, dt_s, window, update, basis, along, most)
         made = [
-            designs(*one, window, update, basis, functions_within(band_hz, dt_s))
-            for one, band_hz in zip(chosen, bands_hz, strict=True)
+            designs(*one, window, update, basis, functions)
+            for one, functions in zip(chosen, most, strict=True)
         ]
         for one in made:
             one.check()
@@ -315,8 +315,6 @@ class PreviewFbf:
             found = axis.command(rung, task, careful)
             command = found.position_mm
             reached = Extremes.of(command, command[0], command[0], stops=True)
-            if not careful:
-                asked = reached
             rms = np.sqrt(reached.mean_square) / dt**2
             if rms > task.rms_limit_mm_s2 and rung < GENTLE_RUNG:
                 break
@@ -331,12 +329,14 @@ class PreviewFbf:
             if outside <= careful or not (few or rung == axis.last_rung):
                 break
             careful |= outside
+        path = Extremes.of(task.path_mm, task.path_mm[0], task.path_mm[0])
         raise DesignError(
-            f"axis {axis.name}: even the gentlest design asks for {asked.accel / dt**2:.0f} mm/s2, "
-            f"{asked.speed / dt:.0f} mm/s and {asked.low_mm:.3f} to {asked.high_mm:.3f} mm; "
-            f"allowed are {bounds.accel / dt**2:.0f} mm/s2, {bounds.speed / dt:.0f} mm/s and "
-            f"{bounds.low_mm:g} to {bounds.high_mm:g} mm (command and travel limits of the "
-            "machine; docs/proof.md tells how to measure what its motors bear)"
+            f"axis {axis.name}: even the gentlest design does not stay within "
+            f"{bounds.accel / dt**2:.0f} mm/s2, {bounds.speed / dt:.0f} mm/s and {bounds.low_mm:g} "
+            f"to {bounds.high_mm:g} mm; the path itself asks for {path.accel / dt**2:.0f} mm/s2, "
+            f"{path.speed / dt:.0f} mm/s and {path.low_mm:g} to {path.high_mm:g} mm (allowed are "
+            f"the command and travel limits of the machine, but at most {ACCEL_RATIO:g} times the "
+            "path's acceleration; docs/proof.md tells how to measure what the motors bear)"
         )
 
 

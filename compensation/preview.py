@@ -101,7 +101,7 @@ class PreviewDesign:
         if not self.condition <= MAX_CONDITION:
             raise DesignError(
                 f"{n} {basis} functions over {window} samples are nearly dependent "
-                f"(condition {self.condition:.1e}, limit {MAX_CONDITION:.0e}): take fewer"
+                f"(condition {self.condition:.1e}, limit {MAX_CONDITION:.0e}): take another basis"
             )
         self.basis = np.ascontiguousarray(solve_triangular(r, psi.T, trans="T").T)
         self.effort = self.basis.T @ self.basis
@@ -121,8 +121,8 @@ class PreviewDesign:
         if not self.spectral_radius <= MAX_SPECTRAL_RADIUS:
             raise DesignError(
                 f"{n} {basis} functions over {window} samples: the windows' recursion has spectral "
-                f"radius {self.spectral_radius:.3f}, limit {MAX_SPECTRAL_RADIUS}; take a longer "
-                "window or fewer functions"
+                f"radius {self.spectral_radius:.3f}, limit {MAX_SPECTRAL_RADIUS}: a plant "
+                "rings for longer than a window; take robust off or another basis, or measure again"
             )
 
     @cached_property

@@ -255,7 +255,8 @@ class PreviewAxis:
         self.window, self.update = designs.lifted.window, designs.lifted.update
         self._plants = designs.lifted.plants
         self.members = len(self._plants)
-        self._memory = max(round(p.settling_time_s(_FORGOTTEN) / p.dt_s) for p in self._plants)
+        settling = [p.settling_time_s(_FORGOTTEN) / p.dt_s for p in self._plants]
+        self._memory = max(1, round(max(settling)))
         self._rest_at_one = np.concatenate([p.rest_state() for p in self._plants])
         self.rung = self.next_rung = 0
         self._made: _Drive | None = None
@@ -269,7 +270,7 @@ class PreviewAxis:
         self._states = np.zeros(sum(p.order for p in self._plants))
 
     def observe(self, command: Array) -> None:
-        """Account for a command (n,) made elsewhere; what follows begins a sample after its last."""
+        """Account for a command (n,) made elsewhere; what follows begins one sample later."""
         if len(command) == 0:
             return
         origin = float(command[-1])

@@ -121,6 +121,7 @@ def balanced_weights(
     update: int,
     basis: str,
     along: float,
+    most: tuple[int, int] = (300, 300),
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Return weights of the members that make their contour errors e_j more equal.
 
@@ -133,6 +134,8 @@ def balanced_weights(
     x, y : plants and given weights of either axis, equally many
     dt_s, window, update, basis, along
         Of the design that will use the weights.
+    most : (int, int)
+        Most functions per 300 samples, as in `compensation.preview_axis.functions_within`.
     """
     path, extruding = reference_motion(dt_s)
     n = path.shape[1]
@@ -142,13 +145,13 @@ def balanced_weights(
     found = [weights.copy() for weights in given]
     for _ in range(_WEIGHT_ROUNDS):
         axes = [
-            PreviewAxis(name, Designs(lifted_window(plants, weights, window, update), basis))
-            for name, (plants, _), weights in zip("xy", (x, y), found, strict=True)
+            PreviewAxis(name, Designs(lifted_window(plants, weights, window, update), basis, n))
+            for name, (plants, _), weights, n in zip("xy", (x, y), found, most, strict=True)
         ]
-        chosen: list[Choice] = [(_WEIGHT_RUNG, frozenset())] * 2
+        chosen: list[Choice] = [(min(_WEIGHT_RUNG, axis.last_rung), frozenset()) for axis in axes]
         commands = [
-            axis.command(_WEIGHT_RUNG, task, frozenset())
-            for axis, task in zip(axes, tasks, strict=True)
+            axis.command(rung, task, frozenset())
+            for axis, task, (rung, _) in zip(axes, tasks, chosen, strict=True)
         ]
         if along < 1.0:
             commands = slide(axes, commands, tasks, chosen, extruding, along, dt_s)

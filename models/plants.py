@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
+from numpy.polynomial.polynomial import polyval
 from numpy.typing import ArrayLike, NDArray
 
 from stillpath.models.errors import ModelError
@@ -61,6 +62,8 @@ __all__ = [
 ]
 
 Matrix = NDArray[np.float64]
+_MOST_ELEMENTS = 1_000_000
+"""Of the matrices that a frequency response inverts at a time."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,11 +99,16 @@ class _StateSpace:
     def _at(self, points: NDArray[np.complex128]) -> NDArray[np.complex128]:
         if self.order == 0:
             return np.full(len(points), self.d, complex)
-        shifted = points[:, None, None] * np.eye(self.order) - self.a
-        states = np.linalg.solve(
-            shifted, np.broadcast_to(self.b[:, None], (len(points), self.order, 1))
-        )
-        response: NDArray[np.complex128] = states[:, :, 0] @ self.c + self.d
+        response = np.empty(len(points), complex)
+        # A long FIR plant has hundreds of states: not all matrices at once.
+        block = max(1, _MOST_ELEMENTS // self.order**2)
+        for begin in range(0, len(points), block):
+            part = points[begin : begin + block]
+            shifted = part[:, None, None] * np.eye(self.order) - self.a
+            states = np.linalg.solve(
+                shifted, np.broadcast_to(self.b[:, None], (len(part), self.order, 1))
+            )
+            response[begin : begin + block] = states[:, :, 0] @ self.c + self.d
         return response
 
 
@@ -264,7 +272,8 @@ def frequency_response(
         return plant.frequency_response(f_hz)
     f = np.atleast_1d(np.asarray(f_hz, float))
     if isinstance(plant, FirSpec):
-        return _as_sampled(plant).frequency_response(f)
+        taps = np.array(plant.taps) / float(np.sum(plant.taps))
+        return np.asarray(polyval(np.exp(-2j * np.pi * f * plant.dt_s), taps), complex)
     roots = plant.roots()
     discrete = roots.dt_s is not None
     at = np.exp(2j * np.pi * f * (roots.dt_s or 0.0)) if discrete else 2j * np.pi * f
@@ -314,6 +323,8 @@ def _undo_hold(plant: DiscretePlant, spec: PlantSpec) -> ContinuousPlant:
     """Invert the first-order hold."""
     from scipy.linalg import expm, logm
 
+    if plant.order == 0:
+        return ContinuousPlant(plant.a, plant.b, plant.c, plant.d, plant.notes)
     roots: Roots = spec.roots()
     negative = (roots.poles.imag == 0) & (roots.poles.real <= 0)
     if negative.any():

@@ -69,7 +69,7 @@ def mean_spectrum(spectra: Sequence[Spectrum]) -> Spectrum:
     Raises
     ------
     ModelError
-        If there is no spectrum, or no column is in all of them.
+        If there is no spectrum, no column is in all of them, or their bands do not overlap.
     """
     if not spectra:
         raise ModelError("no spectrum to average: give one or more")
@@ -82,7 +82,14 @@ def mean_spectrum(spectra: Sequence[Spectrum]) -> Spectrum:
             f"the {len(spectra)} spectra share no column (the first has {', '.join(first.psd)}); "
             "fit them one by one"
         )
-    f = first.f_hz[first.f_hz <= min(float(s.f_hz.max()) for s in spectra)]
+    low = max(float(s.f_hz.min()) for s in spectra)
+    high = min(float(s.f_hz.max()) for s in spectra)
+    f = first.f_hz[(first.f_hz >= low) & (first.f_hz <= high)]
+    if len(f) < 2:
+        raise ModelError(
+            f"the {len(spectra)} spectra share no frequencies (the highest start is {low:.1f} Hz, "
+            f"the lowest end {high:.1f} Hz); fit them one by one"
+        )
     tiny = np.finfo(float).tiny
     logs = {
         name: np.mean(

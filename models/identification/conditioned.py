@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import TypeAlias
 
 from pydantic import ValidationError
 
@@ -13,7 +14,13 @@ from stillpath.models.errors import ModelError
 from stillpath.models.identification.conditions import Condition
 from stillpath.models.identification.prompt import prompt
 from stillpath.models.identification.sets import parametric_members
-from stillpath.models.identification.types import AxisIdentification, Fit, ModeEstimate
+from stillpath.models.identification.types import (
+    AxisIdentification,
+    Excitation,
+    Fit,
+    ModeEstimate,
+    Spectrum,
+)
 from stillpath.models.plants import ParametricMembers, PlantSetSpec
 from stillpath.models.provenance import Kind
 from stillpath.models.schedule import (
@@ -25,7 +32,10 @@ from stillpath.models.schedule import (
 )
 from stillpath.models.store import explain
 
-__all__ = ["schedulable", "scheduled", "special", "usual"]
+__all__ = ["check_labels", "of_one_test", "schedulable", "scheduled", "special", "usual"]
+
+Tested: TypeAlias = tuple[Spectrum, Excitation, Condition]
+"""A spectrum, the test that made it, and under what condition."""
 
 _REPEATABLE = 0.0035
 """Relative standard deviation of a frequency from run to run: +-0.7 % within a session."""
@@ -51,6 +61,39 @@ def usual(conditions: Sequence[Condition], axis: str) -> list[Condition]:
             "what the machine starts a print with"
         )
     return [sorted(empty, key=lambda c: c.position_mm)[len(empty) // 2]]
+
+
+def check_labels(common: Sequence[Condition], axis: str) -> None:
+    """Refuse spectra with several labels: only of one label they have a mean.
+
+    Raises
+    ------
+    ModelError
+    """
+    if len(common) > 1:
+        labels = ", ".join(c.label or "none" for c in common)
+        raise ModelError(
+            f"axis {axis}: the spectra have different labels ({labels}), so they have no mean; "
+            "identify from those of one label, or leave the labels out if they are repeats (labels "
+            "keep raw logs apart)"
+        )
+
+
+def of_one_test(spectra: Sequence[Tested], axis: str) -> tuple[list[Tested], list[str]]:
+    """Leave out usual spectra except those of the most frequent test and label; say which.
+
+    As responses, logs of several tests or labels are members of one set; spectra have no mean.
+    """
+    common = usual([c for _, _, c in spectra], axis)
+    tests = [(e, c) for _, e, c in spectra if c in common]
+    most = max(tests, key=tests.count)
+    kept = [(s, e, c) for s, e, c in spectra if c not in common or (e, c) == most]
+    notes = [
+        f"{s.source}: not used, because spectra of different tests or labels have no mean"
+        for s, e, c in spectra
+        if c in common and (e, c) != most
+    ]
+    return kept, notes
 
 
 def special(conditions: Sequence[Condition]) -> list[Condition]:

@@ -18,7 +18,13 @@ from stillpath.models.identification.alignment import (
     spectrum_along,
 )
 from stillpath.models.identification.averaging import mean_response, mean_spectrum
-from stillpath.models.identification.conditioned import scheduled, special, usual
+from stillpath.models.identification.conditioned import (
+    check_labels,
+    of_one_test,
+    scheduled,
+    special,
+    usual,
+)
 from stillpath.models.identification.conditions import Condition
 from stillpath.models.identification.estimation import (
     estimate_aligned,
@@ -59,6 +65,7 @@ from stillpath.models.identification.spectrum_fit import (
     Explanations,
     explanations,
     refit_spectrum,
+    same_test,
 )
 from stillpath.models.identification.trust import check_axes, check_informative, keeps_time
 from stillpath.models.identification.types import (
@@ -314,15 +321,12 @@ class _AxisWork:
         )
         nominal = found.fit
         assert nominal is not None
-        fits = {
-            condition: refit_spectrum(
-                mean_spectrum([s for s, _, c in spectra if c == condition]),
-                next(e for _, e, c in spectra if c == condition),
-                nominal,
-                column=self._settings.sensor_axis,
-            )
-            for condition in special([c for _, _, c in spectra])
-        }
+        fits: dict[Condition, Fit] = {}
+        for condition in special([c for _, _, c in spectra]):
+            under = [s for s, _, c in spectra if c == condition]
+            test = same_test(under, [e for _, e, c in spectra if c == condition])
+            column = self._settings.sensor_axis
+            fits[condition] = refit_spectrum(mean_spectrum(under), test, nominal, column=column)
         others = tuple(s for s, _, c in spectra if c not in common)
         found = replace(found, measured=(*found.measured, *others), notes=tuple(by_file(notes)))
         return scheduled(found, nominal, fits, "spectrum")
@@ -339,18 +343,20 @@ class _AxisWork:
             for aligned, one in zip(self._aligned, self._used, strict=True)
             if isinstance(log := one.measurement, AccelerationLog)
         ]
+        self._spectra, left_out = of_one_test(self._spectra, self._axis)
         self._explanations = self._explained()
         found = self._from_spectra(frame_likely)
         return replace(
             found,
             plants=self._rubbing(found.plants),
-            notes=(*found.notes, *body_notes(self._friction_mm, None)),
+            notes=(*found.notes, *body_notes(self._friction_mm, None), *left_out),
             warnings=(*found.warnings, phase_warning(self._axis, poor)),
         )
 
     def _explained(self) -> Explanations:
         """Return what explains the spectra without a condition of their own."""
         common = usual([c for _, _, c in self._spectra], self._axis)
+        check_labels(common, self._axis)
         chosen = [(s, e) for s, e, c in self._spectra if c in common]
         return explanations(
             [s for s, _ in chosen],

@@ -45,7 +45,7 @@ from stillpath.models.identification.types import (
 )
 from stillpath.models.plants import RelativeModesSpec
 
-__all__ = ["Explained", "Explanations", "explanations", "refit_spectrum"]
+__all__ = ["Explained", "Explanations", "explanations", "refit_spectrum", "same_test"]
 
 _GOOD_DB, _NO_WORSE = 1.0, 1.1
 
@@ -157,21 +157,16 @@ def explanations(
         If there is no spectrum, the tests differ, the column does not exist or is dead, or too few
         bins are left.
     """
-    tests = [excitation] if isinstance(excitation, Excitation) else list(excitation)
-    if any(test != tests[0] for test in tests):
-        raise ModelError(
-            f"{', '.join(s.source for s in spectra)}: the spectra come from different tests "
-            "(accel_per_hz, range or direction), so they have no mean; identify from those of one "
-            "test"
-        )
+    tests = [excitation] if isinstance(excitation, Excitation) else excitation
+    test = same_test(spectra, tests)
     single = mean_spectrum(spectra)
     name = _column(single, column)
-    search = Search(single, name, tests[0], spectra, max_order)
+    search = Search(single, name, test, spectra, max_order)
     found = search.candidates(progress)
     accepted, drawn = _explanations(search, found, progress)
     return Explanations(
         spectra=tuple(spectra),
-        excitation=tests[0],
+        excitation=test,
         column=name,
         search=search,
         found=tuple(found),
@@ -179,6 +174,23 @@ def explanations(
         drawn=tuple(drawn),
         frame_hz=frame_hz_of([c.structure.spec(c.theta) for c in (*accepted, *drawn)]),
     )
+
+
+def same_test(spectra: Sequence[Spectrum], tests: Sequence[Excitation]) -> Excitation:
+    """Return the test that made all spectra.
+
+    Raises
+    ------
+    ModelError
+        If there are several: spectra of different tests have no mean.
+    """
+    if any(test != tests[0] for test in tests):
+        raise ModelError(
+            f"{', '.join(s.source for s in spectra)}: the spectra come from different tests "
+            "(accel_per_hz, range or direction), so they have no mean; identify from those of one "
+            "test"
+        )
+    return tests[0]
 
 
 def _explanations(

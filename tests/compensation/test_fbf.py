@@ -8,7 +8,7 @@ import pytest
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.fbf import PreviewFbf
 from stillpath.models.machine import CommandLimits, Machine
-from stillpath.models.plants import plant_set
+from stillpath.models.plants import FirSpec, PlantSetSpec, plant_set
 from stillpath.models.store import load_machine
 from stillpath.simulation.measures import contour_error
 from stillpath.simulation.response import response
@@ -110,7 +110,8 @@ def test_impossible_limits(machine: Machine, command: CommandLimits) -> None:
     path, extruding, rests = strokes()
     fbf = made(machine.model_copy(update={"command": command}), path[:, 0])
     with pytest.raises(
-        DesignError, match=r"axis x: even the gentlest design .* mm/s2, \d+ mm/s and .* mm; allowed"
+        DesignError,
+        match=r"axis x: even the gentlest design .* mm/s2, \d+ mm/s and .* the path itself",
     ):
         fbf.compensate(path, extruding, rests)
 
@@ -188,3 +189,14 @@ def test_far_from_the_origin(machine: Machine) -> None:
     away = path + 1000.0
     far = made(machine, away[:, 0]).compensate(away, extruding, rests)
     np.testing.assert_allclose(far - 1000.0, near, atol=1e-9)
+
+
+def test_an_axis_without_dynamics_is_told_its_path() -> None:
+    still = PlantSetSpec(nominal=FirSpec(taps=(1.0,), dt_s=1e-3))
+    machine = load_machine("ender3").model_copy(update={"axes": {"x": still, "y": still}})
+    design = PreviewFbf(machine, 1e-3)
+    path = np.outer([20.0, 8.0], 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, 400)))
+    design.reset(path[:, 0])
+    design.observe(path[:, :1])
+    command = design.compensate(path, np.ones(400, bool), np.zeros((0, 2), np.int64))
+    np.testing.assert_allclose(command, path, atol=1e-3)

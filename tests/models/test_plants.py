@@ -137,6 +137,23 @@ def test_fir_is_its_taps() -> None:
     assert discretise(FirSpec(taps=(1.0,), dt_s=1e-3), 1e-3).order == 0
 
 
+def test_an_axis_without_dynamics_is_a_plant() -> None:
+    still = FirSpec(taps=(1.0,), dt_s=1e-3)
+    for plant in (still, discretise(still, 2e-3), continuous(still)):
+        np.testing.assert_array_equal(frequency_response(plant, [10.0, 90.0]), 1.0)
+
+
+def test_a_long_impulse_response_takes_little_memory() -> None:
+    """By its polynomial, and by its states block by block, as scipy says."""
+    taps = np.exp(-np.arange(512) / 60.0) * np.sin(np.arange(512) / 9.0) + 0.01
+    taps /= taps.sum()
+    spec = FirSpec(taps=tuple(taps.tolist()), dt_s=1e-3)
+    f_hz = np.array([1.0, 20.0, 333.0])
+    _, wanted = scipy.signal.freqz(taps, worN=2e-3 * np.pi * f_hz)
+    np.testing.assert_allclose(frequency_response(spec, f_hz), wanted, rtol=1e-9)
+    np.testing.assert_allclose(frequency_response(discretise(spec, 1e-3), f_hz), wanted, rtol=1e-9)
+
+
 def test_discrete_plant_at_another_sampling_time() -> None:
     fine = discretise(PAIRS, 5e-4)
     again = ZpkSpec(

@@ -12,6 +12,7 @@ import pytest
 
 from stillpath.applications.identification.run import InputFile
 from stillpath.models.errors import ModelError
+from stillpath.models.identification.conditioned import Tested, of_one_test
 from stillpath.models.identification.conditions import Condition
 from stillpath.models.identification.identify import Measured, identify
 from stillpath.models.identification.modal_fit import fit_modes
@@ -21,9 +22,11 @@ from stillpath.models.identification.synthetic import Sensor
 from stillpath.models.identification.types import (
     AccelerationLog,
     AxisIdentification,
+    Excitation,
     FrequencyResponse,
     Measurement,
     PlantModel,
+    Spectrum,
 )
 from stillpath.models.plants import (
     PairsSpec,
@@ -37,6 +40,7 @@ from tests.models.identification.recordings import (
     LEGACY,
     QUICK,
     QUICK_SETTINGS,
+    SWEEPING,
     one_mode,
     quick_log,
     quick_raw,
@@ -453,6 +457,35 @@ def test_spectra_of_different_tests_have_no_mean() -> None:
     ]
     with pytest.raises(ModelError, match=r"csv, .*csv: the spectra come from different tests"):
         one(*files, settings=ReadSettings())
+    empty = spectrum_file(one_mode(55.0, 0.06), name="20260101_110000")
+    loaded = [replace(file, condition=Condition.parse("+0.5kg")) for file in files]
+    with pytest.raises(ModelError, match=r"csv, .*csv: the spectra come from different tests"):
+        one(empty, *loaded, settings=ReadSettings())
+
+
+def test_spectra_of_different_labels_have_no_mean() -> None:
+    files = [spectrum_file(one_mode(50.0, 0.06), condition=label) for label in ("slow", "fast")]
+    with pytest.raises(ModelError, match=r"different labels \(slow, fast\)"):
+        one(*files)
+
+
+def test_logs_that_become_spectra_keep_the_most_of_one_test() -> None:
+    """Where no model explains the phase of raw logs of several tests."""
+
+    def tested(name: str, test: Excitation, condition: str = "") -> Tested:
+        (file,) = read(spectrum_file(one_mode(50.0, 0.06), QUICK, name=name))
+        assert isinstance(file.measurement, Spectrum)
+        return file.measurement, test, Condition.parse(condition)
+
+    old, new, again, loaded = (
+        tested("20240101_120000", LEGACY),
+        tested("20260101_120000", SWEEPING),
+        tested("20260101_130000", SWEEPING),
+        tested("20240101_140000", LEGACY, "+0.5kg"),
+    )
+    kept, notes = of_one_test([old, new, again, loaded], "x")
+    assert [s.source for s, _, _ in kept] == [s.source for s, _, _ in (new, again, loaded)]
+    assert [old[0].source in note for note in notes] == [True]
 
 
 # Progress

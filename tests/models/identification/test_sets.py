@@ -186,6 +186,14 @@ def test_mean_spectrum_is_geometric() -> None:
         mean_spectrum([a, Spectrum(f, {"y": np.ones(len(f))})])
 
 
+def test_mean_spectrum_ends_where_a_table_does() -> None:
+    f = np.arange(5.0, 100.0)
+    whole, part = Spectrum(f, {"x": np.ones(len(f))}), Spectrum(f[35:80], {"x": np.ones(45)})
+    np.testing.assert_array_equal(mean_spectrum([whole, part]).f_hz, part.f_hz)
+    with pytest.raises(ModelError, match="share no frequencies"):
+        mean_spectrum([whole, Spectrum(f + 200.0, {"x": np.ones(len(f))})])
+
+
 def test_plant_set_of_a_fit_survives_json() -> None:
     found = response_set([response(plant())], axis="x")
     assert found.fit is not None
