@@ -1,7 +1,7 @@
 """Filtered basis functions blended with a shaper, for plants that are only partly known.
 
 Where the members of a set disagree, inverting the plant in the middle makes the others worse; a
-shaper, which only smooths symmetrically, does little good and little harm to any. Plant and command
+shaper, which only smooths, helps every member a little and harms none. Plant and command
 are linear, so for every member the error of a mixture of both commands is the mixture of their
 errors, and the best mixture can be computed (`pipeline.caution`).
 """

@@ -59,7 +59,7 @@ stay below twice the path's."""
 RMS_RATIO = 1.5
 """The same for the rms acceleration, unless that would cost functions."""
 _BOUNDED_SHARE = 0.2
-"""If more windows exceed the bounds, a gentler design is used instead of solving them again."""
+"""Share of windows that may be solved again within bounds; above it a gentler design is used."""
 _BOUNDED_ROUNDS = 4
 _REACH_S, _STRIDE = 0.03, 7
 """The nearest point of the path is searched within this time, at every 7th sample."""
@@ -178,7 +178,7 @@ class PreviewFbf:
         """Do nothing: the plants of this machine are constant."""
 
     def ease(self, accel_share: float) -> bool:
-        """Use at most this share of the machine's acceleration from now on; 0 is not possible."""
+        """Use at most this share of the machine's acceleration from now on; 0 is refused."""
         self._accel_share = accel_share
         return accel_share > 0.0
 

@@ -345,7 +345,7 @@ class PreviewAxis:
         n, origin, end_mm = len(task.path_mm), self._origin, float(task.path_mm[-1])
         u[n - 1] = end_mm - origin
         states = self._advanced(last_states, u[len(u) - self.update : n - 1])
-        # Off the rounding by which a bounded solution may miss the end of the travel.
+        # Snap positions that rounding put just outside the travel.
         u += origin
         position = _snapped(u[:n], task.bounds)
         position[-1] = end_mm

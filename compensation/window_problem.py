@@ -1,10 +1,10 @@
-"""The optimisation problem of a single window with rests and within bounds.
+"""Keep a window within the machine's bounds, and prepare windows with rests for the kernels.
 
 During a rest [a, b) only E or Z moves and X and Y must stand still. The increments are fixed there:
 the one at a stops the command, the others are zero, and the remaining ones are found by weighted
 least squares with a small penalty on acceleration, under the constraint that the command stands
 exactly on the path. The weight is low inside the rest (nothing is printed) and normal after it,
-otherwise the command would drift away (docs/method.md).
+otherwise the command would drift away (docs/method.md; solved in `_window_kernels`).
 
 If the solution exceeds the machine's bounds, the same problem is solved as a quadratic programme
 (DAQP, a dual active-set method).

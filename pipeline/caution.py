@@ -1,4 +1,4 @@
-"""Blend fbf with a shaper so that no likely plant does worse: what `robust=auto` decides.
+"""Mix fbf with a shaper as far as the plants are known: what `robust=auto` decides.
 
 For every plant that explains the measurement, a file should print no worse than with the shaper
 tuned from the same measurement. Both commands are therefore simulated on the reference motion with
@@ -218,7 +218,7 @@ def choose_caution(
     shaper : BestShaper
         Tuned for the nominal plants.
     directory : Path
-        Cache of the choices.
+        Folder in which choices are kept.
     dt_s : float
         Sampling time of the commands.
     basis : str

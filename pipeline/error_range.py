@@ -1,7 +1,7 @@
 """Predict the range in which a contour error lies, over everything that explains a measurement.
 
 Plants of a set differ in what they do to a command; so do known friction and the delay of one axis
-against the other. Dry friction, which resonance tables cannot show at all, is told apart.
+against the other. Dry friction, which resonance tables cannot show at all, is stated separately.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class ErrorRange:
     low, high : float
         Least and largest ratio of the members' error (delays included) to it.
     friction_um : float
-        What friction that the measurement cannot show adds to the square at most.
+        What friction that the measurement cannot show adds at most, in quadrature.
     """
 
     reference_um: float

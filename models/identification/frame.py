@@ -22,8 +22,8 @@ P = TypeVar("P", bound=PlantSpec)
 _HIGHEST_HZ, _BELOW, _SHARE = 30.0, 0.7, 0.25
 """A frame's mode is at most this high, this ratio to the strongest mode, and this large a share."""
 LIKELY = 0.8
-"""Probability that a weak mode far below the strongest is the frame's; a response cannot show it.
-Mistaking the frame's for the nozzle's costs more than the reverse (docs/tried.md)."""
+"""Probability that a weak mode far below the strongest is the frame's; no measurement on the axis
+tells. Mistaking the frame's for the nozzle's costs more than the reverse (docs/tried.md)."""
 _UNLIKE, _UNLIKE_LIKELY = 1.5, 0.3
 """A frame stands on the same feet in X and in Y, and its frequencies there are alike: within 1.43
 times in spectra of 60 virtual printers, as a moving bed lowers that of Y. Modes further apart are

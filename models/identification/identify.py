@@ -1,4 +1,4 @@
-"""Identifies the plants of a machine's axes from measurements.
+"""Identify the plants of a machine's axes from measurements.
 
 Measurements are grouped by axis; logs become frequency responses, those become a nominal plant and
 a set. What was measured with a weight on the bed or at different places becomes a schedule.

@@ -1,4 +1,4 @@
-"""Choose a dozen plants to represent many: those that differ most in effect on a command."""
+"""Choose up to sixteen plants that represent many: those that differ most in effect on a path."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Population(Generic[P]):
     crowd: tuple[P, ...]
 
     def agree_below_hz(self) -> float:
-        """Return the frequency above which members do not agree on what arrives."""
+        """Return the frequency up to which all members respond alike to a command."""
         answers = np.array([frequency_response(m, _F_HZ) for m in self.members])
         apart = np.max(np.abs(answers - answers[0]), axis=0) > _APART
         return float(_F_HZ[np.argmax(apart)]) if apart.any() else float(_F_HZ[-1])
@@ -106,6 +106,7 @@ def representatives(centres: Sequence[P], crowd: Sequence[P]) -> Population[P]:
         places.append(answers[chosen])
         nearest = np.minimum(nearest, np.linalg.norm(answers - answers[chosen], axis=1))
     belongs = np.argmin([np.linalg.norm(answers - place, axis=1) for place in places], axis=0)
+    # One more each: a member that represents only itself must not vanish.
     stands_for = np.bincount(belongs, minlength=len(members)) + 1.0
     weights = stands_for / stands_for.sum()
     return Population(tuple(members), tuple(weights.tolist()), middle, tuple(crowd))

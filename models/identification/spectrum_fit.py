@@ -48,6 +48,7 @@ from stillpath.models.plants import RelativeModesSpec
 __all__ = ["Explained", "Explanations", "explanations", "refit_spectrum", "same_test"]
 
 _GOOD_DB, _NO_WORSE = 1.0, 1.1
+"""Fits that may be the central plant: within 1 dB, or 1.1 times the best one's residual."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
