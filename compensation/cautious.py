@@ -63,6 +63,7 @@ class CautiousFbf:
         if not all(0.0 <= share <= 1.0 for share in caution.shares):
             raise DesignError(f"shares of filtered basis functions are {caution.shares}: 0 to 1")
         self._inner = inner
+        inner.leave_out([share == 0.0 for share in caution.shares])
         self._smoothing = ShaperCompensator(
             machine, dt_s, shaper=caution.shaper, fx_hz=caution.fx_hz, fy_hz=caution.fy_hz
         )

@@ -12,6 +12,7 @@ For a plant set the error along the path may count less than the error across it
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, TypeAlias
 
@@ -139,6 +140,7 @@ class PreviewFbf:
             low_mm=-np.inf,
             high_mm=np.inf,
         )
+        self._unused = [False, False]
         self._last: list[AxisCommand] = []
         self.rungs: tuple[int, ...] = ()
         # Delays are not vibration: leading the path by them would help only if they were exact.
@@ -173,6 +175,10 @@ class PreviewFbf:
         """Mark a command (2, n) derived from the last one as executed."""
         for axis, command in zip(self._axes, command_mm, strict=True):
             axis.commit_as(command)
+
+    def leave_out(self, unused: Sequence[bool]) -> None:
+        """Do not let limits of X or Y refuse a piece where nobody uses that axis's command."""
+        self._unused = list(unused)
 
     def operate_at(self, point: OperatingPoint) -> None:
         """Do nothing: the plants of this machine are constant."""
@@ -214,10 +220,11 @@ class PreviewFbf:
         if n > 2:
             largest = max(one.mean_square for one in asked)
             rms_limit = RMS_RATIO * np.sqrt(largest) / self._dt_s**2
+        rms_limits = np.where(self._unused, np.inf, rms_limit)
         accel_limits = self._accel_limits_mm_s2(asked)
         tasks = [
-            AxisTask(path, weight, stops, self._bounds(i, asked[i], accel_limits[i]), rms_limit)
-            for i, path in enumerate(y_d_mm)
+            AxisTask(path, weight, stops, self._bounds(i, asked[i], accel_limits[i]), rms)
+            for i, (path, rms) in enumerate(zip(y_d_mm, rms_limits, strict=True))
         ]
         found = [self._ladder(axis, task) for axis, task in zip(self._axes, tasks, strict=True)]
         if np.isfinite([self._motors.accel, self._motors.speed]).any():
@@ -292,6 +299,8 @@ class PreviewFbf:
 
     def _bounds(self, i: int, asked: Extremes, accel_limit: float) -> Bounds:
         travel, dt = self._travel[i], self._dt_s
+        if self._unused[i]:
+            return Bounds(np.inf, np.inf, -np.inf, np.inf)
         return Bounds(
             accel=accel_limit * dt**2,
             speed=self._limits[i].velocity_mm_s * dt,

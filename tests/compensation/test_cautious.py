@@ -9,7 +9,7 @@ from stillpath.compensation.base import DesignError
 from stillpath.compensation.cautious import Caution
 from stillpath.compensation.registry import compensator
 from stillpath.compensation.shapers import ShaperCompensator
-from stillpath.models.machine import Machine
+from stillpath.models.machine import AxisLimits, Machine
 from stillpath.models.plants import plant_set
 from stillpath.models.reference_motion import reference_motion
 from stillpath.models.store import load_machine
@@ -85,6 +85,19 @@ def test_a_whole_share_leaves_the_machine_as_its_own_design_does() -> None:
             one.commit()
         made.append(last)
     np.testing.assert_allclose(*made, atol=1e-6)
+
+
+def test_an_axis_of_the_shaper_alone_refuses_nothing() -> None:
+    """Y was typed in and bears little; X keeps its compensation."""
+    path, extruding = short()
+    axes = {"y": AxisLimits(accel_mm_s2=50.0)}
+    slow = MACHINE.model_copy(update={"command": MACHINE.command.model_copy(update={"axes": axes})})
+    commands = []
+    for machine in (MACHINE, slow):
+        one = compensator("fbf", machine, DT_S, robust="ensemble", caution=caution(0.85, 0.0))
+        one.reset(path[:, 0])
+        commands.append(one.compensate(path, extruding, NO_RESTS))
+    np.testing.assert_array_equal(*commands)
 
 
 def test_shares_are_shares() -> None:
