@@ -302,11 +302,11 @@ class Job:
             return
         self.compensated.append(lines)
         self._work.compensator.commit()
-        self._verifier.passed(attempt.motion.executed_mm)
+        # The last sample of an item is the first one of the next.
+        written = part_of(attempt.motion, 0, len(attempt.motion) - 1)
+        self._verifier.passed(written.executed_mm)
         self._sum.add_piece(attempt.made, attempt.executed, attempt.gap_mm)
         with self._clock.stage("measure"):
-            # The last sample of an item is the first one of the next.
-            written = part_of(attempt.motion, 0, len(attempt.motion) - 1)
             if self._budget is None or self._pairs is None:
                 self._measurement.add(written)
             else:

@@ -67,9 +67,11 @@ class MotionRecord:
         """Return the motion of a piece as the firmware executes the sliced file."""
         phases = piece.phases
         grid = (0.0, DT_S, max(round(phases.duration_s / DT_S), 1))
-        path, row = sample_phases(self._asked(piece, phases), grid)
+        asked = self._asked(piece, phases)
+        path, row = sample_phases(asked, grid)
         sliced = sample_phases(phases, grid, flat=True)[0] if self._rounds else path
-        return self._samples(piece, row, path, sliced, phases.prints[row], sliced)
+        moved = self._samples(piece, row, path, sliced, phases.prints[row], sliced)
+        return _ending(moved, asked, phases)
 
     def pass_by(self, verbatim: VerbatimPart, part: Phases | float | None) -> None:
         """Measure a verbatim part: motion, standing still [s], or (None) a lost position."""
@@ -103,7 +105,9 @@ class MotionRecord:
             path, row, extruding = sample_until(asked, grid, until, axes=3)
             sliced = sample_phases(phases, grid, flat=True)[0] if self._rounds else path
             at = phases.move_index[row]
-            self._measurement.add(self._samples(verbatim, at, path, sliced, extruding, sliced))
+            moved = self._samples(verbatim, at, path, sliced, extruding, sliced)
+            last = start + _CHUNK >= samples
+            self._measurement.add(_ending(moved, asked, phases) if last else moved)
             self._observe(path[:2])
 
     def _observe(self, command_mm: np.ndarray) -> None:
@@ -142,3 +146,8 @@ class MotionRecord:
 
     def _asked(self, item: Piece | VerbatimPart, phases: Phases) -> Phases:
         return intended(phases, item.moves.start_mm, item.moves.end_mm, self._step_mm)
+
+
+def _ending(samples: MotionSamples, planned: Phases, sliced: Phases) -> MotionSamples:
+    """Return samples with the end of their motion, which lies up to 1.5 samples after the last."""
+    return replace(samples, next_mm=np.append(planned.end_mm[-1, :2], sliced.end_mm[-1, :2]))

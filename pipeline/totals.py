@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from stillpath.gcode.pieces import LeftOut, VerbatimPart
+from stillpath.gcode.pieces import LeftOut, Piece, VerbatimPart
 from stillpath.gcode.types import Phases
 from stillpath.pipeline.piece_compensator import DT_S, CompensatedPiece
 from stillpath.pipeline.result import PutBack
@@ -71,7 +71,8 @@ class Totals:
         if np.any(feeds):
             self.passed_s += extruding_s
             first = phases.move_index[int(np.argmax(feeds))]
-            self.passed_line = self.passed_line or int(verbatim.moves.line[first])
+            if not isinstance(verbatim, Piece):  # a piece was reverted for a reason of its own
+                self.passed_line = self.passed_line or int(verbatim.moves.line[first])
 
     def figures(self, *, compensates: bool) -> dict[str, Any]:
         """Return the fields of `Result` that are sums or follow from sums.

@@ -185,8 +185,14 @@ class ContourMeter:
         return self._measure(self._path_from + self._path.shape[1] - self._window)
 
     def flush(self) -> ContourErrors:
-        """Return the errors of the samples still waiting; their window ends with the motion."""
-        return self._measure(self._path_from + self._path.shape[1])
+        """Return the errors of the samples still waiting; their window ends with the motion.
+
+        What is pushed afterwards is another motion.
+        """
+        errors = self._measure(self._path_from + self._path.shape[1])
+        self._path_from += self._path.shape[1]
+        self._path = self._path[:, :0]
+        return errors
 
     def _measure(self, stop: int) -> ContourErrors:
         """Errors of the due samples before `stop`; forget what no later sample needs."""

@@ -35,7 +35,8 @@ class MachineStream:
     point : OperatingPoint
         Where the machine is at first; without schedules it does not matter.
     member : int, optional
-        The plants with this number in the sets of both axes answer, not the nominal ones.
+        The plants with this number in the sets of both axes answer, not the nominal ones; the
+        shorter list repeats.
     """
 
     def __init__(
@@ -102,7 +103,8 @@ class MachineStream:
     def _plant(self, axis: PlantSetSpec) -> DiscretePlant:
         if self._member is None:
             return discretise(axis.nominal, self._dt_s)
-        return plant_set(axis, self._dt_s).members[self._member]
+        members = plant_set(axis, self._dt_s).members
+        return members[self._member % len(members)]
 
     def _answer(self, u_mm: Array, path_mm: Array, out: Array) -> None:
         if len(self._streams) == 1:

@@ -14,6 +14,8 @@ __all__ = ["LayerViews"]
 
 _LAYERS_SHOWN = 24
 _POINTS_PER_LAYER = 2500
+_MOST_HELD = 4
+"""Times the points that are shown, so that a layer of several tiles is thinned evenly."""
 
 
 class LayerViews:
@@ -34,9 +36,10 @@ class LayerViews:
         """Add a layer, or more of one."""
         if tile.layer < 0 or tile.layer % self._every:
             return
-        part = _thinned(replace(tile, error=np.where(tile.error == UNKNOWN, 0, tile.error)))
+        part = replace(tile, error=np.where(tile.error == UNKNOWN, 0, tile.error))
         known = self._layers.get(tile.layer)
-        self._layers[tile.layer] = part if known is None else _thinned(_joined(known, part))
+        whole = part if known is None else _joined(known, part)
+        self._layers[tile.layer] = _thinned(whole, _MOST_HELD * _POINTS_PER_LAYER)
         while len(self._layers) > 2 * _LAYERS_SHOWN:
             self._every *= 2
             self._layers = {k: v for k, v in self._layers.items() if k % self._every == 0}
@@ -47,7 +50,7 @@ class LayerViews:
         if len(numbers) > _LAYERS_SHOWN:
             pick = np.linspace(0, len(numbers) - 1, _LAYERS_SHOWN).round().astype(int)
             numbers = [numbers[i] for i in pick]
-        return [self._view(self._layers[k]) for k in numbers]
+        return [self._view(_thinned(self._layers[k], _POINTS_PER_LAYER)) for k in numbers]
 
     def _view(self, tile: LayerTile) -> LayerView:
         return LayerView(
@@ -76,25 +79,33 @@ def _joined(first: LayerTile, second: LayerTile) -> LayerTile:
     )
 
 
-def _thinned(tile: LayerTile) -> LayerTile:
-    """Return a tile in which several stretches are merged, keeping the largest of their errors.
+def _thinned(tile: LayerTile, most: int) -> LayerTile:
+    """Return a tile of at most so many points.
 
-    A merged stretch never contains both extrusion and travel.
+    Travel is not drawn, so each is one point: where extrusion begins. Stretches of extrusion are
+    merged, keeping the largest of their errors. Of more lines than that, every k-th is kept.
     """
     count = len(tile)
-    if count <= _POINTS_PER_LAYER:
+    if count <= most:
         return tile
-    step = -(-count // _POINTS_PER_LAYER)
-    run = np.concatenate([[0], np.flatnonzero(np.diff(tile.on)) + 1, [count]])
-    place = np.arange(count) - np.repeat(run[:-1], np.diff(run))
-    first = np.flatnonzero(place % step == 0)
+    run = np.concatenate([[0], np.flatnonzero(np.diff(tile.on)) + 1])
+    size = np.diff(np.append(run, count))
+    prints = np.repeat(tile.on[run] > 0, size)
+    # A travel and the line after it belong together.
+    pair = (np.arange(len(run)) + prints[0]) // 2
+    every = -(-len(run) // most)
+    step = count if every > 1 else -(-count // max(most - len(run), 1))
+    place = np.arange(count) - np.repeat(run, size)
+    first = np.flatnonzero((place == 0) | (prints & (place % step == 0)))
     last = np.append(first[1:], count) - 1
+    kept = np.repeat(pair % every == 0, size)[first]
+    error = np.maximum.reduceat(tile.error, first, axis=1)
     return replace(
         tile,
-        x_mm=tile.x_mm[last],
-        y_mm=tile.y_mm[last],
-        line=tile.line[last],
-        error=np.maximum.reduceat(tile.error, first, axis=1),
-        feature=tile.feature[last],
-        on=tile.on[last],
+        x_mm=tile.x_mm[last[kept]],
+        y_mm=tile.y_mm[last[kept]],
+        line=tile.line[last[kept]],
+        error=error[:, kept],
+        feature=tile.feature[last[kept]],
+        on=tile.on[last[kept]],
     )

@@ -133,26 +133,14 @@ class Measurement:
         """Stand still; return the position for every sample, (2, n), if known."""
         if self._last is None or samples == 0:
             return None
-        last = self._last
-        rows = np.full(samples, len(last) - 1)
-        position = last.path_mm[:, rows]
-        self.add(
-            MotionSamples(
-                path_mm=position,
-                executed_mm=position,
-                z_mm=last.z_mm[rows],
-                extruding=np.zeros(samples, dtype=bool),
-                row=last.row[rows],
-                moves=last.moves,
-                first_move=last.first_move,
-                sliced_mm=None if last.sliced_mm is None else last.sliced_mm[:, rows],
-            )
-        )
-        return position
+        stood = self._last.standing(samples)
+        self.add(stood)
+        return stood.path_mm
 
     def jump(self) -> None:
         """Forget the position: the machine stands still when motion resumes."""
         self._measure(self._answers.flush())
+        self._note(self._meter.flush())
         self._band.jump()
         self._maxima.jump()
         self._spectra.jump()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,8 @@ class MotionSamples:
         Number of the first of them in the file.
     sliced_mm : ndarray, shape (2, n), optional
         X and Y as the firmware executes the sliced file, if not as planned.
+    next_mm : ndarray, shape (4,), optional
+        Where the motion goes on, or stands: planned X and Y, then X and Y of the sliced file.
     """
 
     path_mm: Array
@@ -39,9 +41,27 @@ class MotionSamples:
     moves: Moves
     first_move: int = 0
     sliced_mm: Array | None = None
+    next_mm: Array | None = None
 
     def __len__(self) -> int:
         return int(self.path_mm.shape[1])
+
+    def standing(self, samples: int) -> MotionSamples:
+        """Return the motion of a machine that stands still after this one."""
+        rows = np.full(samples, len(self) - 1)
+        at_mm = _at(self, len(self) - 1) if self.next_mm is None else self.next_mm
+        position, sliced = (
+            np.repeat(xy[:, None], samples, axis=1) for xy in (at_mm[:2], at_mm[2:])
+        )
+        return replace(
+            self,
+            path_mm=position,
+            executed_mm=position,
+            z_mm=self.z_mm[rows],
+            extruding=np.zeros(samples, dtype=bool),
+            row=self.row[rows],
+            sliced_mm=None if self.sliced_mm is None else sliced,
+        )
 
 
 def part_of(samples: MotionSamples, start: int, stop: int) -> MotionSamples:
@@ -55,7 +75,13 @@ def part_of(samples: MotionSamples, start: int, stop: int) -> MotionSamples:
         samples.moves,
         samples.first_move,
         None if samples.sliced_mm is None else samples.sliced_mm[:, start:stop],
+        _at(samples, stop) if stop < len(samples) else samples.next_mm,
     )
+
+
+def _at(samples: MotionSamples, k: int) -> Array:
+    sliced = samples.path_mm if samples.sliced_mm is None else samples.sliced_mm
+    return np.concatenate([samples.path_mm[:, k], sliced[:, k]])
 
 
 @dataclass(frozen=True, slots=True)

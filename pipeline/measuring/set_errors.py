@@ -62,10 +62,10 @@ class ErrorSum:
 def machine_numbers(machine: Machine, dt_s: float) -> list[int | None]:
     """Return the numbers of the machines of a set: the nominal one (None), and the members.
 
-    Member k of X and member k of Y make one machine; surplus members of an axis are left out.
+    Member k of X and member k of Y make one machine; the shorter list repeats.
     """
     sets = [plant_set(machine.axes[axis], dt_s) for axis in ("x", "y")]
-    return [None, *range(min(len(one.members) for one in sets))]
+    return [None, *range(max(len(one.members) for one in sets))]
 
 
 class SetErrors:
@@ -102,6 +102,7 @@ class SetErrors:
 
     def jump(self) -> None:
         """Forget the motion so far: the machine stands still when it resumes."""
+        self._note(self._meter.flush())
         self._fresh, self._since = True, self._never
 
     def add(self, path_mm: Array, command_mm: Array, extruding: Mask, classes: Ints) -> None:

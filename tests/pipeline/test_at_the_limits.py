@@ -92,16 +92,32 @@ def test_what_climbs_too_fast_is_told(tmp_path: Path, cache: Path) -> None:
     assert any("climb faster than Z can follow" in warning for warning in result.warnings)
 
 
+RINGS = "G1 F6000\n" + 4 * "G1 X84 Y77 E1\nG1 X59 Y84 E1\nG1 X37 Y61 E1\nG1 X60 Y50 E1\n"
+
+
+def with_steps(steps_per_mm: float) -> Machine:
+    """A RepRapFirmware printer that moves in so many steps."""
+    drive = Drive(steps_per_mm=steps_per_mm, max_speed_mm_s=300.0, max_accel_mm_s2=3000.0)
+    own = RepRapFirmware(x=drive, y=drive, home_mm=(0.0, 0.0, 0.0))
+    return load_machine("annex-k3").model_copy(update={"firmware": own})
+
+
+def test_what_is_left_alone_begins_where_it_was_switched_off(tmp_path: Path, cache: Path) -> None:
+    """Not at a piece that was reverted before, for a reason of its own."""
+    text = HEAD + RINGS + "; STILLPATH_OFF\n" + 6 * RINGS + "; STILLPATH_ON\n"
+    result, _ = compensated(text, tmp_path, cache, with_steps(32.0))
+    assert result.put_back
+    (told,) = [one for one in result.warnings if "keep their own lines" in one]
+    first = text[: text.index("; STILLPATH_OFF")].count("\n") + 3
+    assert f"from line {first} on" in told
+
+
 @pytest.mark.parametrize(("steps_per_mm", "told"), [(32.0, True), (400.0, False)])
 def test_where_the_shaper_would_serve_better_it_is_said(
     steps_per_mm: float, told: bool, tmp_path: Path, cache: Path
 ) -> None:
     """Vertices on steps of .03 mm shake the printer more than the sliced file: that stays."""
-    drive = Drive(steps_per_mm=steps_per_mm, max_speed_mm_s=300.0, max_accel_mm_s2=3000.0)
-    own = RepRapFirmware(x=drive, y=drive, home_mm=(0.0, 0.0, 0.0))
-    machine = load_machine("annex-k3").model_copy(update={"firmware": own})
-    ring = "G1 X84 Y77 E1\nG1 X59 Y84 E1\nG1 X37 Y61 E1\nG1 X60 Y50 E1\n"
-    result, _ = compensated(HEAD + "G1 F6000\n" + 4 * ring, tmp_path, cache, machine)
+    result, _ = compensated(HEAD + RINGS, tmp_path, cache, with_steps(steps_per_mm))
     assert ["as sliced" in one.reason for one in result.put_back] == [True] * told
     assert any("shaper would serve this file better" in w for w in result.warnings) is told
 

@@ -10,11 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stillpath.gcode.pacing import TRAVEL, FirstLayer
+from stillpath.models.plants import PlantSetSpec
 from stillpath.models.store import load_machine
-from stillpath.pipeline.measuring.set_errors import ClassError, ErrorSum
+from stillpath.pipeline.measuring.set_errors import ClassError, ErrorSum, machine_numbers
 from stillpath.pipeline.pacing.budget import SpeedBudget
 from stillpath.pipeline.pacing.pace_search import PaceChoice, allowed_um, search
 from stillpath.pipeline.pacing.pace_trials import Factors, Tried
+from stillpath.simulation.scheduled import MachineStream
 
 WALL, INFILL = 0, 1
 
@@ -142,3 +144,16 @@ def test_a_file_above_its_budget_is_written_anew() -> None:
     assert last.gentler(over) is None
     # What is as it was sliced cannot be milder.
     assert budget(wall=1.0, travel=1.0).gentler(over) is None
+
+
+def test_every_plant_of_the_larger_set_is_judged() -> None:
+    """Also where one axis was measured, and the other has one plant."""
+    machine = load_machine("ender3")
+    one = PlantSetSpec(nominal=machine.axes["y"].nominal)
+    narrow = machine.model_copy(update={"axes": {**machine.axes, "y": one}})
+    count = len(machine.axes["x"].weighted_members())
+    assert machine_numbers(narrow, 1e-3) == [None, *range(count)]
+    path = np.outer([1.0, 1.0], np.linspace(0.0, 20.0, 300) % 7.0)
+    moved = [MachineStream(narrow, 1e-3, member=k).push(path, path) for k in range(count)]
+    assert len({part[0].tobytes() for part in moved}) == count
+    assert len({part[1].tobytes() for part in moved}) == 1

@@ -70,6 +70,22 @@ def test_the_whole_print(source: Path, tmp_path: Path, cache: Path) -> None:
     assert set(table["layer"]) <= {-1, 0}
 
 
+def test_a_machine_stands_where_its_line_ended(tmp_path: Path, cache: Path) -> None:
+    """Not where the last sample before the end was: that would be a jump when motion goes on."""
+    source = tmp_path / "in.gcode"
+    source.write_text(HEAD + "M204 S3000\nG1 X70 Y20 F9000\nG4 P300\nG1 X90 Y31 E3\nG4 P300\n")
+    target = tmp_path / "t.npz"
+    machine, options = load_machine("ender3"), Options(method="none")
+    write_trajectories(source, target, machine, options, format="npz", cache_dir=cache)
+    table = load(target)
+    for line, x_mm, y_mm in ((-2, 70.0, 20.0), (-1, 90.0, 31.0)):
+        at = np.flatnonzero((np.diff(table["x_mm"]) == 0.0) & (abs(table["x_mm"][1:] - x_mm) < 0.1))
+        assert len(at) > 250, line
+        for name in ("x_mm", "after_x_mm"):
+            np.testing.assert_allclose(table[name][at + 1], x_mm, atol=1e-9)
+        np.testing.assert_allclose(table["y_mm"][at + 1], y_mm, atol=1e-9)
+
+
 @pytest.mark.parametrize("options", [Options(), Options(method="advise")])
 def test_a_part_of_it_as_text(source: Path, tmp_path: Path, cache: Path, options: Options) -> None:
     machine = load_machine("ender3")

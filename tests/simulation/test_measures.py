@@ -67,6 +67,20 @@ def test_contour_meter_is_brute_force(
     )
 
 
+def test_after_a_flush_another_path_is_measured() -> None:
+    """Nothing leads from the end of one to the beginning of the next."""
+    first, second = wander(1, 150, 0.5, 1.0), wander(2, 150, 0.5, 1.0)
+    meter = ContourMeter(1e-3, 0.08, 2)
+    found = []
+    for y_d, y in (first, second):
+        found += [meter.push(y_d + 0.7, y[None] + 0.7), meter.flush()]
+    expected = [contour_error(y_d + 0.7, y + 0.7, stride=2) for y_d, y in (first, second)]
+    np.testing.assert_array_equal(
+        np.concatenate([part.error_mm[0] for part in found]), np.concatenate(expected)
+    )
+    assert found[-1].index[-1] == 298
+
+
 def test_contour_error_of_a_late_point_is_zero_on_a_straight_line() -> None:
     y_d = np.vstack([np.arange(500) * 0.1, np.zeros(500)])
     late = np.roll(y_d, 20, axis=1)
