@@ -166,7 +166,8 @@ class BudgetClass(_Figures):
     title: str
     """The same, for display."""
     acceleration_factor: float
-    """Ratio of its accelerations to the file's, before the machine's limits; 1: as in the file."""
+    """Ratio of its accelerations to the file's, before the machine's limits, geometric mean over
+    the print; 1: as in the file."""
     shaper_acceleration_factor: float
     """The same with the best firmware shaper at the same budget."""
     contour_rms_um: float

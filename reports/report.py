@@ -83,14 +83,14 @@ def headline_figures(channels: Sequence[Channel]) -> dict[str, Any]:
     """Contour error rms while extruding, by channel, and how many times smaller it became.
 
     Of a file that extrudes nothing, such as a coupon drawn with a pen, that of all motion; of one
-    that is compensated in part, that of this part.
+    that is compensated in part, that of the features that were chosen.
     """
     extrudes = any(channel.extruding.contour_max_um > 0 for channel in channels)
     scope = "extruding" if extrudes else "all_motion"
     rms = {channel.name: getattr(channel, scope).contour_rms_um for channel in channels}
     selected = {c.name: c.selected_rms_um for c in channels if c.selected_rms_um is not None}
     rms.update(selected)
-    of = "where it is compensated" if selected else "while extruding"
+    of = "of visible surfaces" if selected else "while extruding"
     before, after = rms.get("before"), rms.get("after")
     ratio = before / after if before and after else None
     ranges = {channel.name: channel.contour_range_um for channel in channels}

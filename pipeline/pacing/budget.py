@@ -9,6 +9,7 @@ finally with its own.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -72,6 +73,8 @@ class SpeedBudget:
         Highest factor of every class.
     attempt : int
         Number of times the file was written before.
+    factors : dict
+        Factor of every class for the pieces that follow.
     """
 
     machine: Machine
@@ -81,16 +84,19 @@ class SpeedBudget:
     shaper_paces: PaceChoice
     tops: Factors
     attempt: int = 0
-    _factors: Factors = field(init=False)
+    factors: Factors = field(init=False)
     _since: dict[int, ErrorSum] = field(init=False, default_factory=dict)
     """Sums of errors when the pace of a class last changed."""
+    _used_logs: dict[int, float] = field(init=False, default_factory=dict)
+    """Integral of the logarithm of each class's factor over the time that was written with it."""
+    _counted_s: dict[int, float] = field(init=False, default_factory=dict)
     _shaper_s: float = field(init=False, default=0.0)
     """Time that the moves so far would take with the shaper."""
     _gentler_s: float = field(init=False, default=0.0)
     """Duration, as sliced, of the pieces that no command could follow at their pace."""
 
     def __post_init__(self) -> None:
-        self._factors = dict(self.paces.factors)
+        self.factors = dict(self.paces.factors)
 
     @classmethod
     def chosen(
@@ -140,7 +146,7 @@ class SpeedBudget:
             with_shaper = paced(piece, classes, paces(self.shaper_paces.factors), self.machine)
             self._shaper_s += with_shaper.phases.duration_s
         for share in _GENTLER:
-            factors = {one: factor**share for one, factor in self._factors.items()}
+            factors = {one: factor**share for one, factor in self.factors.items()}
             faster = paced(piece, classes, paces(factors), self.machine)
             if faster is piece:
                 break
@@ -154,9 +160,15 @@ class SpeedBudget:
 
     def correct(self, sums: Mapping[int, ErrorSum]) -> None:
         """Correct paces by the errors so far: down near the bound, up where there is room."""
-        used = {one: self._used(one, sums[one]) for one in self._factors if one in sums}
+        for one, factor in self.factors.items():
+            if one in sums:
+                seconds = sums[one].seconds
+                new_s = seconds - self._counted_s.get(one, 0.0)
+                self._used_logs[one] = self._used_logs.get(one, 0.0) + new_s * math.log(factor)
+                self._counted_s[one] = seconds
+        used = {one: self._used(one, sums[one]) for one in self.factors if one in sums}
         has_room = max(used.values(), default=0.0) < _FULL
-        for one, factor in sorted(self._factors.items()):
+        for one, factor in sorted(self.factors.items()):
             if one not in used:
                 continue
             new = sums[one] - self._since[one] if one in self._since else sums[one]
@@ -173,24 +185,24 @@ class SpeedBudget:
                 highest = min(self.tops[one], _FURTHEST * self.paces.factors[one])
                 target = max(factor, min(_FASTER * factor, highest))
             if target != factor:
-                self._factors[one], self._since[one] = target, sums[one]
+                self.factors[one], self._since[one] = target, sums[one]
 
     def _slow_others(self) -> None:
         """Slow down what disturbs a class at its own pace: travel first, then all others."""
-        travel_first = self._factors.get(TRAVEL, 1.0) > 1.0
-        for one in [TRAVEL] if travel_first else [*self._factors]:
-            self._factors[one] = max(1.0, _SLOWER * self._factors[one])
+        travel_first = self.factors.get(TRAVEL, 1.0) > 1.0
+        for one in [TRAVEL] if travel_first else [*self.factors]:
+            self.factors[one] = max(1.0, _SLOWER * self.factors[one])
 
     def gentler(self, sums: Mapping[int, ErrorSum]) -> SpeedBudget | None:
         """Return the lower budget for another attempt; None if the written file may stay."""
-        kept = [one for one in self._factors if one in sums and self._keeps_budget(one)]
+        kept = [one for one in self.factors if one in sums and self._keeps_budget(one)]
         over = {one: self._used(one, sums[one]) for one in kept}
         over = {one: ratio for one, ratio in over.items() if ratio > _ABOVE}
         quicker = any(factor > 1.0 for factor in self.paces.factors.values())
         if not over or not quicker or self.attempt + 1 == _ATTEMPTS:
             return None
         factors = {
-            one: min(factor, self.paces.factors[one]) for one, factor in self._factors.items()
+            one: min(factor, self.paces.factors[one]) for one, factor in self.factors.items()
         }
         if self.attempt + 2 == _ATTEMPTS:
             factors = dict.fromkeys(factors, 1.0)
@@ -218,6 +230,11 @@ class SpeedBudget:
         """Return whether a class kept the budget at its own pace in the samples."""
         return self.paces.bounds_um[one] <= allowed_um(one, self.budget_um)
 
+    def _mean_factor(self, one: int) -> float:
+        """Return the geometric mean of a class's factor over the written file."""
+        seconds = self._counted_s.get(one, 0.0)
+        return math.exp(self._used_logs[one] / seconds) if seconds else 1.0
+
     def _used(self, one: int, found: ErrorSum) -> float:
         """Return the ratio of a class's error to its bound."""
         bound_um = self.paces.bounds_um.get(one, allowed_um(one, self.budget_um))
@@ -238,7 +255,7 @@ class SpeedBudget:
                 BudgetClass(
                     name=name,
                     title=feature_title(name),
-                    acceleration_factor=round(self._factors.get(one, 1.0), 4),
+                    acceleration_factor=round(self._mean_factor(one), 4),
                     shaper_acceleration_factor=round(self.shaper_paces.factors.get(one, 1.0), 4),
                     contour_rms_um=found.worst.rms_um,
                     seconds=round(found.seconds, 3),
@@ -260,7 +277,7 @@ class SpeedBudget:
             error = found.worst
             if error.rms_um <= _ABOVE * allowed_um(one, self.budget_um):
                 continue
-            raised = self._factors.get(one, 1.0) > 1.0
+            raised = self._mean_factor(one) > 1.001
             remedy = (
                 "give a smaller budget"
                 if raised
