@@ -161,15 +161,15 @@ class Checker:
         printer: Printer,
         machine: Machine,
         *,
-        method: str = DEFAULT_METHOD,
+        method: str | None = None,
         accept: bool = False,
     ) -> PrinterCheck:
         """Ask a printer and compare it with the machine that files for it are made with.
 
         Parameters
         ----------
-        method : str
-            Of the file; those without a stream need no raised limits.
+        method : str, optional
+            Of the file, otherwise the printer's; those without a stream need no raised limits.
         accept : bool
             Remember the configuration as it is now, whatever it was before.
 
@@ -187,7 +187,7 @@ class Checker:
             asked = ask(printer)
         except (Unreached, Unanswered, TargetRefused, NotReady) as error:
             raise PrinterUnknown(f"{printer.name} cannot be asked: {error}") from error
-        found = findings(machine, asked, method=method)
+        found = findings(machine, asked, method=method or printer.method or DEFAULT_METHOD)
         now = _Remembered(
             printer=printer.name,
             machine=machine.name,
