@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections import Counter
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
 from typing import Any
@@ -135,7 +134,7 @@ def _prepare(state: State, settings: Settings, *, keys_required: bool) -> None:
     state.limits = Limits(settings.requests_per_minute)
     state.readiness = health.Readiness()
     state.printers = load_printers(settings.printers)
-    state.waiting = Counter()  # of jobs, for how many requests
+    state.unshared = set()  # ids of jobs that only the caller who made them knows
     state.metrics = metrics.Metrics(
         lambda: state.store,
         lambda: state.work.workers,

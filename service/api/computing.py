@@ -132,7 +132,7 @@ class ComputeRequest:
 async def run_and_wait(request: Request, caller: Caller, asked: ComputeRequest) -> Job:
     """Return the job of a request when it is done.
 
-    A disconnecting caller cancels it, unless the job existed before.
+    A disconnecting caller cancels it, unless somebody else was given it, too.
 
     Parameters
     ----------
@@ -149,15 +149,22 @@ async def run_and_wait(request: Request, caller: Caller, asked: ComputeRequest) 
     """
     state = request.app.state
     wanted = asked.job(caller.owner)
-    job: Job = await run_in_threadpool(_submit, request, asked, wanted)
-    if job.id == wanted.id:
-        state.work.notify()
-    if not job.state.is_final:
-        await _wait(request, job, ends_with_caller=job.id == wanted.id)
-        found = await run_in_threadpool(state.store.get, job.id)
-        if found is None:
-            raise no_such_job(job.id)
-        job = found
+    if state.settings.scheduler is None:  # else another API may have given it to somebody
+        state.unshared.add(wanted.id)
+    try:
+        job: Job = await run_in_threadpool(_submit, request, asked, wanted)
+        if job.id == wanted.id:
+            state.work.notify()
+        else:
+            state.unshared.discard(job.id)
+        if not job.state.is_final:
+            await _wait(request, job)
+            found = await run_in_threadpool(state.store.get, job.id)
+            if found is None:
+                raise no_such_job(job.id)
+            job = found
+    finally:
+        state.unshared.discard(wanted.id)
     match job.state:
         case JobState.DONE:
             return job
@@ -220,21 +227,16 @@ def _submit(request: Request, asked: ComputeRequest, job: Job) -> Job:
         return found
 
 
-async def _wait(request: Request, job: Job, *, ends_with_caller: bool) -> None:
+async def _wait(request: Request, job: Job) -> None:
     """Wait until the job has ended, or for as long as the caller waits."""
     state = request.app.state
-    state.waiting[job.id] += 1
     try:
         await _while_there(request, _wait_until_final(request, job.id))
     except ClientDisconnect:
-        if ends_with_caller and state.waiting[job.id] == 1:
+        if job.id in state.unshared:
             await run_in_threadpool(state.store.apply, job.id, Cancelled(time.time()))
             state.work.notify()
         raise
-    finally:
-        state.waiting[job.id] -= 1
-        if not state.waiting[job.id]:
-            del state.waiting[job.id]
 
 
 async def _wait_until_final(request: Request, job_id: str) -> None:
