@@ -263,6 +263,11 @@ class Settings:
         if given.config and not self.path.is_file() and not given.setup:
             raise Failure(f"there is no settings file {self.path}")
         read = read_settings(self.path) if self.path.is_file() else {}
+        # First: it counts for whatever else is wrong with them.
+        given.on_error = given.on_error or read.get("on_error", "fail")
+        _check_settings(read, self.path)
+        if given.on_error not in ("fail", "keep"):
+            raise Failure(f"{self.path}: on_error is 'fail' or 'keep', not {given.on_error!r}")
         self.machines: dict[str, str] = read.pop("machines", {})
         self._machine, self._fallback = given.machine, read.pop("machine", None)
         self.file = Path(given.file or "")
@@ -275,9 +280,6 @@ class Settings:
         data = _user_dir("LOCALAPPDATA", "XDG_DATA_HOME", ".local/share")
         self.reports = _path(given.reports or read.get("reports")) or data / "stillpath" / "reports"
         self.report = not given.no_report
-        given.on_error = given.on_error or read.get("on_error", "fail")
-        if given.on_error not in ("fail", "keep"):
-            raise Failure(f"{self.path}: on_error is 'fail' or 'keep', not {given.on_error!r}")
         chosen = {name: getattr(given, name) for name in _OPTIONS}
         chosen["method"] = chosen["method"] or read.get("method")
         self.job_options = {name: value for name, value in chosen.items() if value is not None}
@@ -322,7 +324,7 @@ TEMPLATE = """\
 
 
 def read_settings(path: Path) -> dict[str, Any]:
-    """Return the settings of a TOML file, checked, or raise `Failure` naming what is wrong.
+    """Return the settings of a TOML file, or raise `Failure` naming the line that is wrong.
 
     Before Python 3.11 there is no reader of TOML: then lines ``name = value`` with strings, numbers
     and ``[machines]`` are understood, as the template has them.
@@ -339,7 +341,10 @@ def read_settings(path: Path) -> dict[str, Any]:
         read = _plain_toml(text, path)
     except ValueError as error:
         raise Failure(f"{path}: {error}") from None
-    read = {name.replace("-", "_"): value for name, value in read.items()}
+    return {name.replace("-", "_"): value for name, value in read.items()}
+
+
+def _check_settings(read: Mapping[str, Any], path: Path) -> None:
     for name, value in read.items():
         if name == "machines":
             if not isinstance(value, dict) or not all(isinstance(v, str) for v in value.values()):
@@ -348,7 +353,6 @@ def read_settings(path: Path) -> dict[str, Any]:
             raise Failure(f"{path}: there is no setting {name!r}, but {', '.join(_SETTINGS)}")
         elif not isinstance(value, (int, float) if name in ("timeout", "wait") else str):
             raise Failure(f"{path}: {name} = {value!r} is of the wrong type")
-    return read
 
 
 _TOML_LINE = re.compile(
@@ -363,14 +367,20 @@ def _plain_toml(text: str, path: Path) -> dict[str, Any]:
     read: dict[str, Any] = {}
     table = read
     for number, line in enumerate(text.splitlines(), 1):
-        found = _TOML_LINE.fullmatch(line)
-        if found is None:
-            raise Failure(f"{path}, line {number}: cannot be read: {line.strip()[:80]}")
-        if found["table"]:
-            table = read.setdefault(found["table"], {})
-        elif found["name"]:
-            name = found["name"]
-            table[_toml_value(name) if name[0] in "\"'" else name] = _toml_value(found["value"])
+        try:
+            found = _TOML_LINE.fullmatch(line)
+            if found is None:
+                raise ValueError(line)
+            if found["table"]:
+                table = read.setdefault(found["table"], {})
+            elif found["name"]:
+                name = found["name"]
+                table[_toml_value(name) if name[0] in "\"'" else name] = _toml_value(found["value"])
+        except (ValueError, TypeError):  # TypeError: what is meant as a table has a value already
+            raise Failure(
+                f"{path}, line {number}: cannot be read: {line.strip()[:80]} "
+                "(write paths in single quotes)"
+            ) from None
     return read
 
 
@@ -938,7 +948,7 @@ def _seconds(name: str, *given: float | None) -> float | None:
     """Return the first duration that was given."""
     value = next((value for value in given if value is not None), None)
     if value is not None and not 0 < value < 1e7:
-        raise Failure(f"{name} is {value} s; it must be positive")
+        raise Failure(f"{name} is {value:g} s; give more than 0 and less than 10000000 s")
     return value
 
 
