@@ -37,6 +37,7 @@ __all__ = [
     "WAITING",
     "ComputeRequest",
     "StillRunning",
+    "lost_answer",
     "prefers_page",
     "read_result",
     "run_and_wait",
@@ -194,16 +195,20 @@ async def read_result(request: Request, job: Job) -> Any:
         )
     content = await run_in_threadpool(_content, state.storage, job)
     if content is None:
-        # The same question would lead to this job again.
-        await run_in_threadpool(state.store.forget, job.id)
-        raise Problem(
-            503,
-            "Answer lost",
-            f"The answer of job {job.id} is gone from the storage or damaged, and was deleted: ask "
-            "again, and it is computed anew. Check the storage's disk.",
-            headers={"Retry-After": "1"},
-        )
+        raise await lost_answer(request, job)
     return json.loads(content)
+
+
+async def lost_answer(request: Request, job: Job) -> Problem:
+    """Forget a job, so that the same question does not lead to it again; return the problem."""
+    await run_in_threadpool(request.app.state.store.forget, job.id)
+    return Problem(
+        503,
+        "Answer lost",
+        f"The answer of job {job.id} is gone from the storage or damaged, and was deleted: ask "
+        "again, and it is computed anew. Check the storage's disk.",
+        headers={"Retry-After": "1"},
+    )
 
 
 def _content(storage: Storage, job: Job) -> bytes | None:
