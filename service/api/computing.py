@@ -140,7 +140,7 @@ async def run_and_wait(request: Request, caller: Caller, asked: ComputeRequest) 
     request : Request
         Its body must have been read.
     caller : Caller
-        Whose turn it is.
+        Owner of the job.
 
     Raises
     ------

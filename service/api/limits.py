@@ -46,7 +46,7 @@ class Limits:
     uploads : int
         That one caller may have on their way at once.
     clock : callable
-        Seconds, from anywhere.
+        Monotonic seconds.
     """
 
     def __init__(

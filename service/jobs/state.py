@@ -245,8 +245,9 @@ class Failed:
 class Lost:
     """The worker died, or the service stopped, in the middle of the job.
 
-    `blame` says whether the job may be the cause (not if the service was stopped). `problem` is
-    what the job finally fails with, if more is known than that its worker is gone.
+    `max_attempts` is the number of losses with which the job fails; `blame` says whether it may be
+    the cause (not if the service was stopped). `problem` is what the job finally fails with, if
+    more is known than that its worker is gone.
     """
 
     attempt: int
