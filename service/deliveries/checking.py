@@ -112,7 +112,7 @@ class PrinterCheck(BaseModel):
     remembered_at : datetime
         Of the configuration that later ones are compared with.
     findings : list of Finding
-        Empty: nothing speaks against it.
+        Empty if the printer fits its machine.
     """
 
     printer: str

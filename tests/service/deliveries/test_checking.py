@@ -377,6 +377,8 @@ def test_over_http_and_in_the_report(tmp_path: Path):
             until(lambda: _delivery(client, job)["state"] == "done")
             assert "rotation_distance has changed" in _delivery(client, job)["error"]
             assert client.post("/v1/printers/left/accept").json()["findings"] == []
+            [entry] = client.get("/v1/audit?action=printer.accept").json()["entries"]
+            assert entry["subject"] == "left"
             changed(status, **OWN_LIMIT_MACRO)
             for name, unsafe in (("left", [True]), ("advised", [])):
                 found = client.get(f"/v1/printers/{name}/check").json()["findings"]
