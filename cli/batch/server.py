@@ -18,14 +18,14 @@ if TYPE_CHECKING:
     from stillpath.pipeline.options import Options
     from stillpath.service.api.schemas import JobView
 
-__all__ = ["There", "batch_name"]
+__all__ = ["ServerWorkplace", "batch_name"]
 
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.3, 2.0
 _OF_REQUEST = (400, 401, 403, 422)
 
 
-class There:
-    """Works of a server. A job that was begun goes on there when we are interrupted.
+class ServerWorkplace:
+    """Compensates on a server. A job that was begun goes on there when we are interrupted.
 
     Parameters
     ----------
