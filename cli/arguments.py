@@ -175,7 +175,7 @@ class Refused(Exception):
 
 
 def check_input(source: Path) -> None:
-    """Refuse what cannot be read as a file, and twice."""
+    """Refuse anything but a regular file: the pipeline reads it twice."""
     if source.is_dir():
         raise Refused(f"{source} is a folder, not a G-code file")
     if not source.exists():

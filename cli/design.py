@@ -23,7 +23,7 @@ def design(
         Path | None, typer.Option("--report", metavar="DIR", help="Folder for design.html, .json.")
     ] = None,
 ) -> None:
-    """Look at the design for one axis. Plant, metrics, ladder, and what errors of it cost."""
+    """Show the design for one axis: plant, metrics, ladder of designs, cost of model errors."""
     check_folder(report)
     found = open_machines().to_look_at(machine, files=True).machine
 

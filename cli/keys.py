@@ -97,7 +97,7 @@ def revoke(
 @app.command()
 def first(data_dir: DataDir = None) -> None:
     """Make the first key, with all scopes, before the service's first start, and print it."""
-    with _opened(data_dir) as engine:
+    with _opened(data_dir, may_be_new=True) as engine:
         store = _store(engine)
         secret = store.create_first()
         if secret is None:
@@ -137,11 +137,16 @@ def audit(
 
 
 @contextmanager
-def _opened(data_dir: Path | None) -> Iterator[Engine]:
-    from stillpath.service.database.engine import StoreError, open_database
+def _opened(data_dir: Path | None, *, may_be_new: bool = False) -> Iterator[Engine]:
+    from stillpath.service.database.engine import SQLITE_FILE, StoreError, open_database
     from stillpath.service.security.keys import KeyRefused
 
     settings = service_settings(data_dir=data_dir)
+    is_new = settings.database_url is None and not (settings.data_dir / SQLITE_FILE).exists()
+    if is_new and not may_be_new:
+        raise ModelError(
+            f"there is no database in {settings.data_dir}; name the service's --data-dir"
+        )
     try:
         engine = open_database(settings)
         try:

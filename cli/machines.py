@@ -354,7 +354,7 @@ def check(
         typer.echo(line)
     if found:
         raise typer.Exit(2)
-    typer.echo(f"{name}: nothing speaks against it")
+    typer.echo(f"{name}: no problems found")
 
 
 def _stated(made: NewMachine) -> StatedMachine:

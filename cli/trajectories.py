@@ -86,7 +86,7 @@ def plan(
     plate: PlateOption = None,
     dialect: DialectOption = None,
 ) -> None:
-    """Write the motion the machine will make. Columns t, x, y, z, e."""
+    """Write the motion the machine will make. Columns t (s), x, y, z, e (mm)."""
     check_input(source)
     target = check_output(output)
     if target == source.resolve():

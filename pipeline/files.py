@@ -39,11 +39,16 @@ class Discarding:
 
 
 @contextlib.contextmanager
-def replacing(target: Path) -> Iterator[Path]:
+def replacing(target: Path, mode: int | None = None) -> Iterator[Path]:
     """Yield a temporary file beside `target` that takes its place when the block ends well.
 
     On Linux the file has no name until it is complete (the path goes through ``/proc``), so that a
     killed process leaves nothing behind. Elsewhere a hidden ``.part`` file may remain.
+
+    Parameters
+    ----------
+    mode : int, optional
+        Permissions of the file; otherwise those of the replaced or of any new file.
 
     Raises
     ------
@@ -57,7 +62,8 @@ def replacing(target: Path) -> Iterator[Path]:
     temporary = _named(target) if handle is None else _path_of(handle)
     try:
         yield temporary
-        mode = target.stat().st_mode if target.exists() else 0o666 & ~_umask()
+        if mode is None:
+            mode = target.stat().st_mode if target.exists() else 0o666 & ~_umask()
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())
         with contextlib.suppress(OSError):  # file systems of memory cards have no modes

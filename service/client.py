@@ -145,7 +145,7 @@ class Client:
             try:
                 page = JobPage.model_validate_json(answer.content)
             except ValidationError:
-                raise self._connection.stranger() from None
+                raise self._connection.not_stillpath() from None
             yield from page.jobs
             cursor = page.next
             if cursor is None:
@@ -255,7 +255,7 @@ class Client:
         """Return the machines that jobs can name."""
         found = self._json(self._connection.ask("GET", "/v1/machines"))
         if not isinstance(found, list):
-            raise self._connection.stranger()
+            raise self._connection.not_stillpath()
         return found
 
     def machine(self, name: str) -> dict[str, Any]:
@@ -297,25 +297,25 @@ class Client:
                 if event.get("event") == "job":
                     yield event.get("id", ""), JobView.model_validate_json(event["data"])
         except (ValidationError, KeyError):
-            raise self._connection.stranger() from None
+            raise self._connection.not_stillpath() from None
 
     def _job(self, answer: httpx2.Response) -> JobView:
         try:
             return JobView.model_validate_json(answer.content)
         except ValidationError:
-            raise self._connection.stranger() from None
+            raise self._connection.not_stillpath() from None
 
     def _document(self, answer: httpx2.Response) -> dict[str, Any]:
         found = self._json(answer)
         if not isinstance(found, dict):
-            raise self._connection.stranger()
+            raise self._connection.not_stillpath()
         return found
 
     def _json(self, answer: httpx2.Response) -> Any:
         try:
             return json.loads(answer.content)
         except (ValueError, RecursionError):
-            raise self._connection.stranger() from None
+            raise self._connection.not_stillpath() from None
 
 
 def _path(job_id: str, *more: str) -> str:

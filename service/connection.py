@@ -38,7 +38,7 @@ _ANSWER_S = 60.0
 """How long one answer may take to begin."""
 _SILENCE_S = 45.0
 """Watching is given up when nothing came for so long; the service sends something every 15 s."""
-_GOES, _FETCHES = 3, 4
+_MAX_RESTARTS, _MAX_DOWNLOAD_ATTEMPTS = 3, 4
 
 
 class ClientError(Exception):
@@ -69,11 +69,20 @@ class ClientError(Exception):
 class Broken(Exception):
     """There is no answer, or not all of it: another try may bring it."""
 
-    def __init__(self, reason: str, pause_s: float | None = None, *, midway: bool = False) -> None:
+    def __init__(
+        self,
+        reason: str,
+        pause_s: float | None = None,
+        *,
+        midway: bool = False,
+        answered: bool = False,
+    ) -> None:
         super().__init__(reason)
         self.pause_s = pause_s
         self.midway = midway
         """It broke off in an upload, perhaps after minutes."""
+        self.answered = answered
+        """The service said why it cannot now."""
 
 
 class NoEvents(Exception):
@@ -141,20 +150,28 @@ class Connection:
 
     def patiently(self, ask: Callable[[], Found], tell: Tell | None) -> Found:
         """Return what `ask` returns; what may pass by itself is tried again for some time."""
-        deadline, pause_s, goes = time.monotonic() + self._patience_s, FIRST_PAUSE_S, _GOES
+        deadline, pause_s = time.monotonic() + self._patience_s, FIRST_PAUSE_S
+        restarts_left = _MAX_RESTARTS
         while True:
             try:
                 return ask()
             except Broken as error:
-                if error.midway and goes:
-                    deadline, goes = time.monotonic() + self._patience_s, goes - 1
+                if error.midway and restarts_left:
+                    deadline = time.monotonic() + self._patience_s
+                    restarts_left -= 1
                 wait_s = max(pause_s, error.pause_s or 0.0)
                 if time.monotonic() + wait_s > deadline:
-                    raise ClientError(f"no answer from {self.server}: {error}") from None
+                    raise ClientError(self._given_up(error)) from None
+                state = "is busy" if error.answered else "does not answer"
             if tell is not None:
-                tell("the server does not answer; trying again", None)
+                tell(f"the server {state}; trying again", None)
             time.sleep(wait_s)
             pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
+
+    def _given_up(self, error: Broken) -> str:
+        if error.answered:
+            return f"{self.server} could not take the request: {error}"
+        return f"no answer from {self.server}: {error}"
 
     def post_quietly(self, path: str) -> None:
         """Post once, whatever becomes of it."""
@@ -197,7 +214,7 @@ class Connection:
         """Write an answer to a file, in several goes if need be; its size may be known."""
         with target.open("wb") as file:
             download = _Download(path, file)
-            for attempts_left in reversed(range(_FETCHES)):
+            for attempts_left in reversed(range(_MAX_DOWNLOAD_ATTEMPTS)):
                 try:
                     self.patiently(lambda: self._part(download, tell), tell)
                     break
@@ -216,7 +233,7 @@ class Connection:
         if len(named) == 64 and named != download.digest.hexdigest():
             raise ClientError(f"{path} came damaged from {self.server}; fetch it again")
 
-    def stranger(self) -> ClientError:
+    def not_stillpath(self) -> ClientError:
         """Return the error of an answer that makes no sense."""
         return ClientError(
             f"{self.server} answers, but not as a Stillpath server of version {__version__}"
@@ -234,7 +251,8 @@ class Connection:
         problem = problem if isinstance(problem, dict) else {}
         reason = problem.get("detail") or f"{self.server} answers {status} {answer.reason_phrase}"
         if status in _BUSY and not (status == 503 and problem.get("title") == "Not ready"):
-            raise Broken(str(reason), _seconds(answer.headers.get("retry-after")))
+            pause_s = _seconds(answer.headers.get("retry-after"))
+            raise Broken(str(reason), pause_s, answered=True)
         if 300 <= status < 400:
             reason = f"{self.server} has moved to {answer.headers.get('location')}; name that"
         elif status == 401:

@@ -59,7 +59,8 @@ class Settings(MachineSettings, BaseSettings):
     workers : int
         Processes of its own that do jobs; each handles one at a time.
     max_attempts : int
-        A job fails when it loses its worker for this many times.
+        Number of times a job may lose its worker before it fails; stops of the service do not
+        count.
     heartbeat_timeout_s : float
         A worker that has been silent for so long is lost.
     cancel_grace_s : float

@@ -150,13 +150,13 @@ def _at_work(
         jobs = asked.jobs or os.cpu_count() or 1
         works = LocalPool(open_machines(), options, jobs)
     else:
-        from stillpath.cli.batch.server import There, batch_name
+        from stillpath.cli.batch.server import ServerWorkplace, batch_name
         from stillpath.service.client import Client, ClientError
 
         jobs = asked.jobs or _AT_A_SERVER
         try:
             client = Client(asked.server, asked.key)
-            works = There(client, options, batch_name(output))
+            works = ServerWorkplace(client, options, batch_name(output))
         except ClientError as error:
             sys.stderr.write(f"stillpath: error: {error}\n")
             raise SystemExit(error.exit_code) from None

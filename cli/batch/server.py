@@ -12,20 +12,20 @@ from stillpath.cli.batch.local_workers import Failure, Made, Stopped
 from stillpath.cli.batch.output import Figures, Scratch, Trouble
 from stillpath.cli.batch.worker_pool import Found
 from stillpath.service.client import Client, ClientError
+from stillpath.service.jobs.problems import FILE_TITLES
 
 if TYPE_CHECKING:
     from stillpath.pipeline.options import Options
     from stillpath.service.api.schemas import JobView
 
-__all__ = ["There", "batch_name"]
+__all__ = ["ServerWorkplace", "batch_name"]
 
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.3, 2.0
-_OF_MACHINE = (401, 403, 404)
-_MACHINE_TITLES = ("Unknown machine", "Machine not approved", "The machine", "No compensator")
+_OF_REQUEST = (400, 401, 403, 422)
 
 
-class There:
-    """Works of a server. A job that was begun goes on there when we are interrupted.
+class ServerWorkplace:
+    """Compensates on a server. A job that was begun goes on there when we are interrupted.
 
     Parameters
     ----------
@@ -104,7 +104,8 @@ def _check_done(job: JobView) -> None:
 def _failure_of(error: ClientError) -> Failure:
     """Tell whose fault a refusal is."""
     trouble: Trouble = "computer"
-    if error.is_refused:
-        of_machine = str(error.problem.get("title", "")).startswith(_MACHINE_TITLES)
-        trouble = "machine" if of_machine or error.status in _OF_MACHINE else "file"
+    if error.is_refused and error.problem.get("title") in FILE_TITLES:
+        trouble = "file"
+    elif error.status in _OF_REQUEST:
+        trouble = "machine"
     return Failure(str(error), trouble)

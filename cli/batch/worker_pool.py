@@ -48,7 +48,7 @@ class Workplace(Protocol):
         Raises
         ------
         ModelError
-            There is none, or it is not approved.
+            If there is no such machine, or it is not approved.
         """
 
     def do(self, source: Path, scratch: Scratch, machine: Found, stopping: threading.Event) -> Made:
@@ -64,7 +64,7 @@ class Workplace(Protocol):
 
 
 class LocalPool:
-    """Works of this computer.
+    """Compensates in processes of this computer.
 
     Parameters
     ----------

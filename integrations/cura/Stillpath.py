@@ -202,8 +202,7 @@ class Stillpath(Script):
         name = _job_name()
         try:
             if self._value("where") == "server":
-                page = self._on_server(source, target, name)
-                report = self._write_report(page, name)
+                report = self._on_server(source, target, name)
             else:
                 report = self._by_program(source, name)
                 target = source
@@ -217,16 +216,22 @@ class Stillpath(Script):
         _show(seconds + (f"\n\nReport: {report}" if report else ""), "POSITIVE")
         return made
 
-    def _on_server(self, source: Path, target: Path, name: str) -> bytes:
+    def _on_server(self, source: Path, target: Path, name: str) -> str:
+        """Let a server compensate, and return where the report is."""
         if not self._value("machine"):
             raise Failure("no machine is chosen; the server needs its name")
-        client = Service(self._value("server"), self._value("key"), timeout_s=_PATIENCE_S)
+        why: list[str] = []
+        client = Service(
+            self._value("server"), self._value("key"), timeout_s=_PATIENCE_S, no_report=why.append
+        )
         options = {"machine": self._value("machine"), "name": name, **self._options()}
-        return client.compensate(source, target, options)
+        wanted = bool(self._value("reports"))
+        page = client.compensate(source, target, options, with_report=wanted)
+        if why:
+            return f"none ({why[0]})"
+        return self._write_report(page, name) if wanted else ""
 
     def _write_report(self, page: bytes, name: str) -> str:
-        if not self._value("reports"):
-            return ""
         folder = Path(self._value("reports")).expanduser()
         target = folder / f"{Path(name).stem}.stillpath.html"
         try:
@@ -391,13 +396,15 @@ class Service:
         How long the server may be silent, or away while a job is there, before it is given up.
     tell : callable
         Is told the stage, and the share that is done or None; may raise to stop the work.
+    no_report : callable
+        Is told why there is no report, if it cannot be fetched: the print is right all the same.
     """
 
     _FIRST_PATIENCE_S = 3.0
-    _BUSY = (429, 502, 503, 504)
+    _BUSY = (408, 429, 502, 503, 504)
     _LONGEST_PAUSE_S = 2.0
-    _GOES = 3
-    """So often a transfer that broke off midway, perhaps after minutes, has its patience anew."""
+    _MAX_RESTARTS = 3
+    """How many times a transfer that broke off midway gets its full patience again."""
 
     def __init__(
         self,
@@ -405,6 +412,7 @@ class Service:
         key: str = "",
         timeout_s: float = 60.0,
         tell: Callable[[str, float | None], object] = lambda _stage, _share: None,
+        no_report: Callable[[str], object] = lambda _reason: None,
     ) -> None:
         address, key = address.strip().rstrip("/"), key.strip()
         host = _host_of(address)
@@ -415,7 +423,7 @@ class Service:
         self._address = address
         self._headers = {"Authorization": f"Bearer {key}"} if key else {}
         self._timeout_s = timeout_s
-        self._tell = tell
+        self._tell, self._no_report = tell, no_report
         # A key must not follow a redirection to somewhere else, and no proxy leads to ourselves.
         handlers: list[Any] = [_Web()]
         if host in ("localhost", "127.0.0.1", "::1"):
@@ -423,9 +431,14 @@ class Service:
         self._opener = urllib.request.build_opener(*handlers)
 
     def compensate(
-        self, source: Path, target: Path, options: Mapping[str, Any], wait_s: float | None = None
+        self,
+        source: Path,
+        target: Path,
+        options: Mapping[str, Any],
+        wait_s: float | None = None,
+        with_report: bool = True,
     ) -> bytes:
-        """Send a file, wait, fetch the result and return the page of the report.
+        """Send a file, wait, fetch the result and return the page of the report, if there is one.
 
         Parameters
         ----------
@@ -447,7 +460,7 @@ class Service:
         path = f"/v1/jobs/{quote(self._send(source, options), safe='')}"
         try:
             self._fetch(path, self._wait(path, wait_s), target)
-            return self._ask("GET", f"{path}/report", self._timeout_s)
+            return self._report(f"{path}/report") if with_report else b""
         finally:
             self._forget(path)
 
@@ -462,7 +475,7 @@ class Service:
         return job["id"]
 
     def _upload(
-        self, source: Path, options: Mapping[str, Any], key: str, patience_s: float = 0.0
+        self, source: Path, options: Mapping[str, Any], key: str
     ) -> tuple[dict[str, Any], bool]:
         """Return the job that the server makes of a file, and whether it is a new one.
 
@@ -479,7 +492,7 @@ class Service:
         with source.open("rb") as file:
             size = source.stat().st_size
             body = _CountedFile(file, size, lambda share: self._tell("sending", share), key)
-            answer = self._ask("POST", f"/v1/jobs?{query}", patience_s, body, take)
+            answer = self._ask("POST", f"/v1/jobs?{query}", self._timeout_s, body, take)
         return self._document(answer), is_new
 
     def _wait(self, path: str, wait_s: float | None) -> dict[str, Any]:
@@ -523,6 +536,14 @@ class Service:
             error.filename = str(target)
             raise
 
+    def _report(self, path: str) -> bytes:
+        """Return a report; empty, once `no_report` was told why, if there is none."""
+        try:
+            return self._ask("GET", path, self._timeout_s)
+        except Failure as failure:
+            self._no_report(str(failure))
+            return b""
+
     def _forget(self, path: str) -> None:
         """Delete the job, unless it is gone, or the server: nobody wants it any more."""
         with contextlib.suppress(Failure, _Broken):
@@ -537,23 +558,32 @@ class Service:
         take: Callable[[Any], bytes] = lambda answer: _read(answer),
     ) -> bytes:
         """Return what is taken of the answer; what may pass by itself is tried for some time."""
-        deadline, pause_s, goes = time.monotonic() + patience_s, 0.2, self._GOES
+        deadline, pause_s = time.monotonic() + patience_s, 0.2
+        restarts_left = self._MAX_RESTARTS
         while True:
             try:
                 with self._open(method, path, body) as answer:
                     return take(answer)
             except _Broken as error:
-                if error.midway and goes:
-                    deadline, goes = time.monotonic() + self._timeout_s, goes - 1
-                if time.monotonic() + pause_s > deadline:
-                    raise Failure(
-                        f"no answer from {self._address}: {error}; is the service running there "
-                        "(`stillpath serve`), and is the address right (--server)?",
-                        1,
-                    ) from None
-            self._tell("the server does not answer; trying again", None)
-            time.sleep(pause_s)
+                broken = error
+            if broken.midway and restarts_left:
+                deadline = time.monotonic() + self._timeout_s
+                restarts_left -= 1
+            wait_s = max(pause_s, broken.pause_s or 0.0)
+            if time.monotonic() + wait_s > deadline:
+                raise Failure(self._given_up(broken), 1)
+            state = "does not answer" if broken.pause_s is None else "is busy"
+            self._tell(f"the server {state}; trying again", None)
+            time.sleep(wait_s)
             pause_s = min(2 * pause_s, self._LONGEST_PAUSE_S)
+
+    def _given_up(self, broken: _Broken) -> str:
+        if broken.pause_s is not None:
+            return f"{self._address} could not take the request: {broken}"
+        return (
+            f"no answer from {self._address}: {broken}; is the service running there "
+            "(`stillpath serve`), and is the address right (--server)?"
+        )
 
     def _open(
         self,
@@ -576,9 +606,13 @@ class Service:
             return self._opener.open(request, timeout=timeout_s or self._timeout_s)
         except HTTPError as error:
             with error:
+                problem = _problem(error)
                 if error.code in self._BUSY:
-                    raise _Broken(f"{error.code} {error.reason}") from None
-                raise self._refusal(error) from None
+                    reason = problem.get("detail") or f"{error.code} {error.reason}"
+                    asked = error.headers.get("Retry-After") or ""
+                    pause_s = float(asked) if asked.isascii() and asked.isdigit() else 0.0
+                    raise _Broken(str(reason), pause_s=pause_s) from None
+                raise self._refusal(error, problem) from None
         except (OSError, http.client.HTTPException) as error:
             # Not where all was sent, and the server only says nothing.
             broke_off = isinstance(error, (URLError, ConnectionError, http.client.HTTPException))
@@ -593,16 +627,14 @@ class Service:
             raise Failure(f"{self._address} answers, but not as a Stillpath server", 1)
         return document
 
-    def _refusal(self, error: HTTPError) -> Failure:
+    def _refusal(self, error: HTTPError, problem: Mapping[str, Any]) -> Failure:
         """Return the error for an answer of status 300 or above."""
-        reason = f"{self._address} answers {error.code} {error.reason}"
-        with contextlib.suppress(_Broken):
-            reason = _object(_read(error, 1 << 16)).get("detail") or reason
+        reason = problem.get("detail") or f"{self._address} answers {error.code} {error.reason}"
         if error.code == 401:
             reason = f"the server does not accept the key (401): {reason}"
         elif 300 <= error.code < 400:
             reason = f"{self._address} has moved to {error.headers.get('Location')}; name that"
-        elif error.code == 404 and "/v1/jobs/" in error.url:
+        elif problem.get("title") == "No such job":
             reason = f"the job was cancelled on the server: {reason}"
         return Failure(reason, 2 if error.code < 500 else 1)
 
@@ -621,11 +653,14 @@ _JOB: dict[str, Any] = {
 
 
 class _Broken(Exception):
-    """There is no answer, or not all of it: another try may bring it; `midway`: it broke off."""
+    """There is no good answer, or not all of it: another try may bring it.
 
-    def __init__(self, reason: str, midway: bool = False) -> None:
+    `midway`: it broke off; `pause_s`: how long the server wants to be left alone, if it answered.
+    """
+
+    def __init__(self, reason: str, midway: bool = False, pause_s: float | None = None) -> None:
         super().__init__(reason)
-        self.midway = midway
+        self.midway, self.pause_s = midway, pause_s
 
 
 def _host_of(address: str) -> str:
@@ -643,6 +678,14 @@ def _read(answer: Any, size: int | None = None) -> bytes:
         return bytes(answer.read(size))
     except (OSError, http.client.HTTPException) as error:
         raise _Broken(str(error) or type(error).__name__, midway=True) from None
+
+
+def _problem(error: HTTPError) -> dict[str, Any]:
+    """Return the problem document (RFC 9457) of an answer, empty if there is none."""
+    try:
+        return _object(_read(error, 1 << 16))
+    except _Broken:
+        return {}
 
 
 def _object(answer: bytes) -> dict[str, Any]:

@@ -159,12 +159,19 @@ def _here(path: Path, options: dict[str, Any], voice: Voice, signals: Signals) -
 def _on_server(path: Path, options: dict[str, Any], settings: Settings, voice: Voice) -> bytes:
     """Let a server compensate, and replace the file."""
     before = path.stat()
-    client = Service(settings.server, settings.key, settings.timeout, voice.progress)
-    # Who is killed while he waits or fetches leaves nothing beside the file.
+    client = Service(
+        settings.server,
+        settings.key,
+        settings.timeout,
+        voice.progress,
+        lambda reason: voice.fail(f"warning: no report: {reason}"),
+    )
+    # Fetch into a temporary folder first: a run that is killed meanwhile leaves nothing beside the
+    # file.
     _delete_leftovers(Path(tempfile.gettempdir()), f"{_FOLDER}*", _FOLDER_LEFT_S)
     with tempfile.TemporaryDirectory(prefix=_FOLDER) as folder:
         fetched = Path(folder) / "result"
-        page = client.compensate(path, fetched, options, settings.wait)
+        page = client.compensate(path, fetched, options, settings.wait, settings.report)
         with replacing(path) as temporary:
             shutil.copyfile(str(fetched), str(temporary))
             now = path.stat()
@@ -256,6 +263,11 @@ class Settings:
         if given.config and not self.path.is_file() and not given.setup:
             raise Failure(f"there is no settings file {self.path}")
         read = read_settings(self.path) if self.path.is_file() else {}
+        # First: it counts for whatever else is wrong with them.
+        given.on_error = given.on_error or read.get("on_error", "fail")
+        _check_settings(read, self.path)
+        if given.on_error not in ("fail", "keep"):
+            raise Failure(f"{self.path}: on_error is 'fail' or 'keep', not {given.on_error!r}")
         self.machines: dict[str, str] = read.pop("machines", {})
         self._machine, self._fallback = given.machine, read.pop("machine", None)
         self.file = Path(given.file or "")
@@ -268,9 +280,6 @@ class Settings:
         data = _user_dir("LOCALAPPDATA", "XDG_DATA_HOME", ".local/share")
         self.reports = _path(given.reports or read.get("reports")) or data / "stillpath" / "reports"
         self.report = not given.no_report
-        given.on_error = given.on_error or read.get("on_error", "fail")
-        if given.on_error not in ("fail", "keep"):
-            raise Failure(f"{self.path}: on_error is 'fail' or 'keep', not {given.on_error!r}")
         chosen = {name: getattr(given, name) for name in _OPTIONS}
         chosen["method"] = chosen["method"] or read.get("method")
         self.job_options = {name: value for name, value in chosen.items() if value is not None}
@@ -315,7 +324,7 @@ TEMPLATE = """\
 
 
 def read_settings(path: Path) -> dict[str, Any]:
-    """Return the settings of a TOML file, checked, or raise `Failure` naming what is wrong.
+    """Return the settings of a TOML file, or raise `Failure` naming the line that is wrong.
 
     Before Python 3.11 there is no reader of TOML: then lines ``name = value`` with strings, numbers
     and ``[machines]`` are understood, as the template has them.
@@ -332,7 +341,10 @@ def read_settings(path: Path) -> dict[str, Any]:
         read = _plain_toml(text, path)
     except ValueError as error:
         raise Failure(f"{path}: {error}") from None
-    read = {name.replace("-", "_"): value for name, value in read.items()}
+    return {name.replace("-", "_"): value for name, value in read.items()}
+
+
+def _check_settings(read: Mapping[str, Any], path: Path) -> None:
     for name, value in read.items():
         if name == "machines":
             if not isinstance(value, dict) or not all(isinstance(v, str) for v in value.values()):
@@ -341,7 +353,6 @@ def read_settings(path: Path) -> dict[str, Any]:
             raise Failure(f"{path}: there is no setting {name!r}, but {', '.join(_SETTINGS)}")
         elif not isinstance(value, (int, float) if name in ("timeout", "wait") else str):
             raise Failure(f"{path}: {name} = {value!r} is of the wrong type")
-    return read
 
 
 _TOML_LINE = re.compile(
@@ -356,14 +367,20 @@ def _plain_toml(text: str, path: Path) -> dict[str, Any]:
     read: dict[str, Any] = {}
     table = read
     for number, line in enumerate(text.splitlines(), 1):
-        found = _TOML_LINE.fullmatch(line)
-        if found is None:
-            raise Failure(f"{path}, line {number}: cannot be read: {line.strip()[:80]}")
-        if found["table"]:
-            table = read.setdefault(found["table"], {})
-        elif found["name"]:
-            name = found["name"]
-            table[_toml_value(name) if name[0] in "\"'" else name] = _toml_value(found["value"])
+        try:
+            found = _TOML_LINE.fullmatch(line)
+            if found is None:
+                raise ValueError(line)
+            if found["table"]:
+                table = read.setdefault(found["table"], {})
+            elif found["name"]:
+                name = found["name"]
+                table[_toml_value(name) if name[0] in "\"'" else name] = _toml_value(found["value"])
+        except (ValueError, TypeError):  # TypeError: what is meant as a table has a value already
+            raise Failure(
+                f"{path}, line {number}: cannot be read: {line.strip()[:80]} "
+                "(write paths in single quotes)"
+            ) from None
     return read
 
 
@@ -536,13 +553,15 @@ class Service:
         How long the server may be silent, or away while a job is there, before it is given up.
     tell : callable
         Is told the stage, and the share that is done or None; may raise to stop the work.
+    no_report : callable
+        Is told why there is no report, if it cannot be fetched: the print is right all the same.
     """
 
     _FIRST_PATIENCE_S = 3.0
-    _BUSY = (429, 502, 503, 504)
+    _BUSY = (408, 429, 502, 503, 504)
     _LONGEST_PAUSE_S = 2.0
-    _GOES = 3
-    """So often a transfer that broke off midway, perhaps after minutes, has its patience anew."""
+    _MAX_RESTARTS = 3
+    """How many times a transfer that broke off midway gets its full patience again."""
 
     def __init__(
         self,
@@ -550,6 +569,7 @@ class Service:
         key: str = "",
         timeout_s: float = 60.0,
         tell: Callable[[str, float | None], object] = lambda _stage, _share: None,
+        no_report: Callable[[str], object] = lambda _reason: None,
     ) -> None:
         address, key = address.strip().rstrip("/"), key.strip()
         host = _host_of(address)
@@ -560,7 +580,7 @@ class Service:
         self._address = address
         self._headers = {"Authorization": f"Bearer {key}"} if key else {}
         self._timeout_s = timeout_s
-        self._tell = tell
+        self._tell, self._no_report = tell, no_report
         # A key must not follow a redirection to somewhere else, and no proxy leads to ourselves.
         handlers: list[Any] = [_Web()]
         if host in ("localhost", "127.0.0.1", "::1"):
@@ -568,9 +588,14 @@ class Service:
         self._opener = urllib.request.build_opener(*handlers)
 
     def compensate(
-        self, source: Path, target: Path, options: Mapping[str, Any], wait_s: float | None = None
+        self,
+        source: Path,
+        target: Path,
+        options: Mapping[str, Any],
+        wait_s: float | None = None,
+        with_report: bool = True,
     ) -> bytes:
-        """Send a file, wait, fetch the result and return the page of the report.
+        """Send a file, wait, fetch the result and return the page of the report, if there is one.
 
         Parameters
         ----------
@@ -592,7 +617,7 @@ class Service:
         path = f"/v1/jobs/{quote(self._send(source, options), safe='')}"
         try:
             self._fetch(path, self._wait(path, wait_s), target)
-            return self._ask("GET", f"{path}/report", self._timeout_s)
+            return self._report(f"{path}/report") if with_report else b""
         finally:
             self._forget(path)
 
@@ -607,7 +632,7 @@ class Service:
         return job["id"]
 
     def _upload(
-        self, source: Path, options: Mapping[str, Any], key: str, patience_s: float = 0.0
+        self, source: Path, options: Mapping[str, Any], key: str
     ) -> tuple[dict[str, Any], bool]:
         """Return the job that the server makes of a file, and whether it is a new one.
 
@@ -624,7 +649,7 @@ class Service:
         with source.open("rb") as file:
             size = source.stat().st_size
             body = _CountedFile(file, size, lambda share: self._tell("sending", share), key)
-            answer = self._ask("POST", f"/v1/jobs?{query}", patience_s, body, take)
+            answer = self._ask("POST", f"/v1/jobs?{query}", self._timeout_s, body, take)
         return self._document(answer), is_new
 
     def _wait(self, path: str, wait_s: float | None) -> dict[str, Any]:
@@ -668,6 +693,14 @@ class Service:
             error.filename = str(target)
             raise
 
+    def _report(self, path: str) -> bytes:
+        """Return a report; empty, once `no_report` was told why, if there is none."""
+        try:
+            return self._ask("GET", path, self._timeout_s)
+        except Failure as failure:
+            self._no_report(str(failure))
+            return b""
+
     def _forget(self, path: str) -> None:
         """Delete the job, unless it is gone, or the server: nobody wants it any more."""
         with contextlib.suppress(Failure, _Broken):
@@ -682,23 +715,32 @@ class Service:
         take: Callable[[Any], bytes] = lambda answer: _read(answer),
     ) -> bytes:
         """Return what is taken of the answer; what may pass by itself is tried for some time."""
-        deadline, pause_s, goes = time.monotonic() + patience_s, 0.2, self._GOES
+        deadline, pause_s = time.monotonic() + patience_s, 0.2
+        restarts_left = self._MAX_RESTARTS
         while True:
             try:
                 with self._open(method, path, body) as answer:
                     return take(answer)
             except _Broken as error:
-                if error.midway and goes:
-                    deadline, goes = time.monotonic() + self._timeout_s, goes - 1
-                if time.monotonic() + pause_s > deadline:
-                    raise Failure(
-                        f"no answer from {self._address}: {error}; is the service running there "
-                        "(`stillpath serve`), and is the address right (--server)?",
-                        1,
-                    ) from None
-            self._tell("the server does not answer; trying again", None)
-            time.sleep(pause_s)
+                broken = error
+            if broken.midway and restarts_left:
+                deadline = time.monotonic() + self._timeout_s
+                restarts_left -= 1
+            wait_s = max(pause_s, broken.pause_s or 0.0)
+            if time.monotonic() + wait_s > deadline:
+                raise Failure(self._given_up(broken), 1)
+            state = "does not answer" if broken.pause_s is None else "is busy"
+            self._tell(f"the server {state}; trying again", None)
+            time.sleep(wait_s)
             pause_s = min(2 * pause_s, self._LONGEST_PAUSE_S)
+
+    def _given_up(self, broken: _Broken) -> str:
+        if broken.pause_s is not None:
+            return f"{self._address} could not take the request: {broken}"
+        return (
+            f"no answer from {self._address}: {broken}; is the service running there "
+            "(`stillpath serve`), and is the address right (--server)?"
+        )
 
     def _open(
         self,
@@ -721,9 +763,13 @@ class Service:
             return self._opener.open(request, timeout=timeout_s or self._timeout_s)
         except HTTPError as error:
             with error:
+                problem = _problem(error)
                 if error.code in self._BUSY:
-                    raise _Broken(f"{error.code} {error.reason}") from None
-                raise self._refusal(error) from None
+                    reason = problem.get("detail") or f"{error.code} {error.reason}"
+                    asked = error.headers.get("Retry-After") or ""
+                    pause_s = float(asked) if asked.isascii() and asked.isdigit() else 0.0
+                    raise _Broken(str(reason), pause_s=pause_s) from None
+                raise self._refusal(error, problem) from None
         except (OSError, http.client.HTTPException) as error:
             # Not where all was sent, and the server only says nothing.
             broke_off = isinstance(error, (URLError, ConnectionError, http.client.HTTPException))
@@ -738,16 +784,14 @@ class Service:
             raise Failure(f"{self._address} answers, but not as a Stillpath server", 1)
         return document
 
-    def _refusal(self, error: HTTPError) -> Failure:
+    def _refusal(self, error: HTTPError, problem: Mapping[str, Any]) -> Failure:
         """Return the error for an answer of status 300 or above."""
-        reason = f"{self._address} answers {error.code} {error.reason}"
-        with contextlib.suppress(_Broken):
-            reason = _object(_read(error, 1 << 16)).get("detail") or reason
+        reason = problem.get("detail") or f"{self._address} answers {error.code} {error.reason}"
         if error.code == 401:
             reason = f"the server does not accept the key (401): {reason}"
         elif 300 <= error.code < 400:
             reason = f"{self._address} has moved to {error.headers.get('Location')}; name that"
-        elif error.code == 404 and "/v1/jobs/" in error.url:
+        elif problem.get("title") == "No such job":
             reason = f"the job was cancelled on the server: {reason}"
         return Failure(reason, 2 if error.code < 500 else 1)
 
@@ -766,11 +810,14 @@ _JOB: dict[str, Any] = {
 
 
 class _Broken(Exception):
-    """There is no answer, or not all of it: another try may bring it; `midway`: it broke off."""
+    """There is no good answer, or not all of it: another try may bring it.
 
-    def __init__(self, reason: str, midway: bool = False) -> None:
+    `midway`: it broke off; `pause_s`: how long the server wants to be left alone, if it answered.
+    """
+
+    def __init__(self, reason: str, midway: bool = False, pause_s: float | None = None) -> None:
         super().__init__(reason)
-        self.midway = midway
+        self.midway, self.pause_s = midway, pause_s
 
 
 def _host_of(address: str) -> str:
@@ -788,6 +835,14 @@ def _read(answer: Any, size: int | None = None) -> bytes:
         return bytes(answer.read(size))
     except (OSError, http.client.HTTPException) as error:
         raise _Broken(str(error) or type(error).__name__, midway=True) from None
+
+
+def _problem(error: HTTPError) -> dict[str, Any]:
+    """Return the problem document (RFC 9457) of an answer, empty if there is none."""
+    try:
+        return _object(_read(error, 1 << 16))
+    except _Broken:
+        return {}
 
 
 def _object(answer: bytes) -> dict[str, Any]:
@@ -893,7 +948,7 @@ def _seconds(name: str, *given: float | None) -> float | None:
     """Return the first duration that was given."""
     value = next((value for value in given if value is not None), None)
     if value is not None and not 0 < value < 1e7:
-        raise Failure(f"{name} is {value} s; it must be positive")
+        raise Failure(f"{name} is {value:g} s; give more than 0 and less than 10000000 s")
     return value
 
 

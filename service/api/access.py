@@ -16,7 +16,7 @@ from fastapi import Depends, Request
 from fastapi.security import APIKeyHeader, HTTPAuthorizationCredentials, HTTPBearer
 
 from stillpath.service.api.body_timeout import body_timeout_of
-from stillpath.service.api.limits import Limits, name_of
+from stillpath.service.api.limits import CallerLimits, name_of
 from stillpath.service.api.problems import NO_KEY, Problem
 from stillpath.service.database.engine import DatabaseAway
 from stillpath.service.security.audit import AuditLog
@@ -87,7 +87,7 @@ Operator = Annotated[Caller, Depends(_operator)]
 
 
 async def _uploader(request: Request, caller: Submitter) -> AsyncIterator[Caller]:
-    limits: Limits = request.app.state.limits
+    limits: CallerLimits = request.app.state.limits
     with limits.uploading(caller, body_timeout_of(request.scope)):
         yield caller
 
@@ -99,7 +99,7 @@ def _allowed(request: Request, shown: str | None, scope: Scope, *, counted: bool
     """Return the caller, or raise `Problem`: 401 for a wrong key, 403 for a missing scope."""
     caller = _caller(request, shown)
     if counted:
-        limits: Limits = request.app.state.limits
+        limits: CallerLimits = request.app.state.limits
         limits.take(name_of(caller))
     if not caller.may(scope):
         _deny(
@@ -142,7 +142,7 @@ def _caller(request: Request, shown: str | None) -> Caller:
 
 
 def _turn_away(request: Request, who: Caller, detail: str) -> NoReturn:
-    limits: Limits = request.app.state.limits
+    limits: CallerLimits = request.app.state.limits
     limits.take(name_of(who))
     _deny(request, who, 401, "Unauthorized", detail)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections import Counter
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
 from typing import Any
@@ -41,7 +40,7 @@ from stillpath.service.api.file_responses import Verified
 from stillpath.service.api.guard import Guard, hosts_of
 from stillpath.service.api.hub import Hub
 from stillpath.service.api.intake import Intake
-from stillpath.service.api.limits import Limits
+from stillpath.service.api.limits import CallerLimits
 from stillpath.service.api.parameters import refuse_unknown_parameters
 from stillpath.service.api.proxies import Proxies
 from stillpath.service.database.documents import open_documents
@@ -51,7 +50,7 @@ from stillpath.service.deliveries.printers import load_printers
 from stillpath.service.deliveries.sender import Sender
 from stillpath.service.jobs.store import JobStore
 from stillpath.service.jobs.task import Runner
-from stillpath.service.jobs.work import Work
+from stillpath.service.jobs.work import JobRunner
 from stillpath.service.jobs.worker import run_compensation
 from stillpath.service.security.audit import AuditLog
 from stillpath.service.security.keys import KeyStore, announce_first_key
@@ -73,7 +72,7 @@ Errors are `application/problem+json` (RFC 9457).
 
 
 class _App(FastAPI):
-    """Describes itself to one thread at a time: FastAPI shares what it computes meanwhile."""
+    """FastAPI builds the document without a lock, so two threads would see it half built."""
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(**settings)
@@ -132,10 +131,10 @@ def _prepare(state: State, settings: Settings, *, keys_required: bool) -> None:
     """Set what needs neither database nor workers."""
     state.settings = settings
     state.keys_required = keys_required
-    state.limits = Limits(settings.requests_per_minute)
+    state.limits = CallerLimits(settings.requests_per_minute)
     state.readiness = health.Readiness()
     state.printers = load_printers(settings.printers)
-    state.waiting = Counter()  # of jobs, for how many requests
+    state.unshared = set()  # ids of jobs that only the caller who made them knows
     state.metrics = metrics.Metrics(
         lambda: state.store,
         lambda: state.work.workers,
@@ -210,7 +209,7 @@ async def _open(app: FastAPI, settings: Settings, runner: Runner, stack: AsyncEx
     state.deliveries = Sender(engine, state.store, storage, settings, state.printers, state.checker)
     await run_in_threadpool(state.deliveries.start)
     stack.push_async_callback(run_in_threadpool, state.deliveries.stop)
-    state.work = Work(settings, state.store, storage, runner=runner)
+    state.work = JobRunner(settings, state.store, storage, runner=runner)
     await run_in_threadpool(state.work.start)
     stack.push_async_callback(run_in_threadpool, state.work.stop)
     state.hub = Hub(state.store)

@@ -50,7 +50,7 @@ class BodyTimeout:
         Raises
         ------
         HTTPException
-            408, if it does.
+            408, if fewer than `LEAST_BYTES` came within the limit.
         """
         if self._whole:  # only a disconnect can follow
             return await self._receive()

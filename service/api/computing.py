@@ -37,6 +37,7 @@ __all__ = [
     "WAITING",
     "ComputeRequest",
     "StillRunning",
+    "lost_answer",
     "prefers_page",
     "read_result",
     "run_and_wait",
@@ -132,14 +133,14 @@ class ComputeRequest:
 async def run_and_wait(request: Request, caller: Caller, asked: ComputeRequest) -> Job:
     """Return the job of a request when it is done.
 
-    A disconnecting caller cancels it, unless the job existed before.
+    A disconnecting caller cancels it, unless somebody else was given it, too.
 
     Parameters
     ----------
     request : Request
         Its body must have been read.
     caller : Caller
-        Whose turn it is.
+        Owner of the job.
 
     Raises
     ------
@@ -149,15 +150,22 @@ async def run_and_wait(request: Request, caller: Caller, asked: ComputeRequest) 
     """
     state = request.app.state
     wanted = asked.job(caller.owner)
-    job: Job = await run_in_threadpool(_submit, request, asked, wanted)
-    if job.id == wanted.id:
-        state.work.notify()
-    if not job.state.is_final:
-        await _wait(request, job, ends_with_caller=job.id == wanted.id)
-        found = await run_in_threadpool(state.store.get, job.id)
-        if found is None:
-            raise no_such_job(job.id)
-        job = found
+    if state.settings.scheduler is None:  # else another API may have given it to somebody
+        state.unshared.add(wanted.id)
+    try:
+        job: Job = await run_in_threadpool(_submit, request, asked, wanted)
+        if job.id == wanted.id:
+            state.work.notify()
+        else:
+            state.unshared.discard(job.id)
+        if not job.state.is_final:
+            await _wait(request, job)
+            found = await run_in_threadpool(state.store.get, job.id)
+            if found is None:
+                raise no_such_job(job.id)
+            job = found
+    finally:
+        state.unshared.discard(wanted.id)
     match job.state:
         case JobState.DONE:
             return job
@@ -187,16 +195,20 @@ async def read_result(request: Request, job: Job) -> Any:
         )
     content = await run_in_threadpool(_content, state.storage, job)
     if content is None:
-        # The same question would lead to this job again.
-        await run_in_threadpool(state.store.forget, job.id)
-        raise Problem(
-            503,
-            "Answer lost",
-            f"The answer of job {job.id} is gone from the storage or damaged, and was deleted: ask "
-            "again, and it is computed anew. Check the storage's disk.",
-            headers={"Retry-After": "1"},
-        )
+        raise await lost_answer(request, job)
     return json.loads(content)
+
+
+async def lost_answer(request: Request, job: Job) -> Problem:
+    """Forget a job, so that the same question does not lead to it again; return the problem."""
+    await run_in_threadpool(request.app.state.store.forget, job.id)
+    return Problem(
+        503,
+        "Answer lost",
+        f"The answer of job {job.id} is gone from the storage or damaged, and was deleted: ask "
+        "again, and it is computed anew. Check the storage's disk.",
+        headers={"Retry-After": "1"},
+    )
 
 
 def _content(storage: Storage, job: Job) -> bytes | None:
@@ -220,21 +232,16 @@ def _submit(request: Request, asked: ComputeRequest, job: Job) -> Job:
         return found
 
 
-async def _wait(request: Request, job: Job, *, ends_with_caller: bool) -> None:
+async def _wait(request: Request, job: Job) -> None:
     """Wait until the job has ended, or for as long as the caller waits."""
     state = request.app.state
-    state.waiting[job.id] += 1
     try:
         await _while_there(request, _wait_until_final(request, job.id))
     except ClientDisconnect:
-        if ends_with_caller and state.waiting[job.id] == 1:
+        if job.id in state.unshared:
             await run_in_threadpool(state.store.apply, job.id, Cancelled(time.time()))
             state.work.notify()
         raise
-    finally:
-        state.waiting[job.id] -= 1
-        if not state.waiting[job.id]:
-            del state.waiting[job.id]
 
 
 async def _wait_until_final(request: Request, job_id: str) -> None:

@@ -52,7 +52,7 @@ async def _asked(
     return DesignReport.model_validate(await read_result(request, job))
 
 
-Asked = Annotated[DesignReport, Depends(_asked)]
+FoundDesign = Annotated[DesignReport, Depends(_asked)]
 
 
 @router.get(
@@ -61,7 +61,7 @@ Asked = Annotated[DesignReport, Depends(_asked)]
     responses={200: {"content": {"text/html": {}}}, **WAITING, **responses(404, 422)},
     summary="Get the design for an axis",
 )
-async def read_design(found: Asked, accept: Annotated[str, Header()] = "*/*") -> Response:
+async def read_design(found: FoundDesign, accept: Annotated[str, Header()] = "*/*") -> Response:
     """Return the figures as JSON, or as a page if that is what `Accept` names first.
 
     The first request for a machine, axis, basis and robust mode takes some ten seconds.
@@ -78,7 +78,7 @@ async def read_design(found: Asked, accept: Annotated[str, Header()] = "*/*") ->
     responses={**WAITING, **responses(404, 422)},
     summary="Get the design for an axis, as a page",
 )
-async def read_design_page(found: Asked) -> HTMLResponse:
+async def read_design_page(found: FoundDesign) -> HTMLResponse:
     """Return one self-contained HTML page."""
     return await run_in_threadpool(_page, found)
 

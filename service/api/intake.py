@@ -75,12 +75,12 @@ class Intake:
     checker : Checker
         Compares a job's printer with its machine; what differs stands in the report.
     disk : Disk
-        That uploads lie on.
+        Disk that holds the uploads.
 
     Attributes
     ----------
     folder : Path
-        Of uploads on their way.
+        Folder for uploads that are still arriving.
     """
 
     def __init__(

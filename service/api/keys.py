@@ -101,9 +101,8 @@ class AuditPage(BaseModel):
 
 
 @router.get("/keys", responses=responses(401, 403, 429), summary="List API keys")
-def list_keys(request: Request, caller: Admin) -> list[KeyView]:
+def list_keys(request: Request, _: Admin) -> list[KeyView]:
     """Return all keys ever made, oldest first, without their secrets."""
-    del caller
     return [KeyView.of(key) for key in _keys(request).list()]
 
 
@@ -161,7 +160,7 @@ def revoke_key(request: Request, key_id: str, caller: Admin) -> Response:
 )
 def read_audit(
     request: Request,
-    caller: Admin,
+    _: Admin,
     limit: Annotated[int, Query(ge=1, le=1000)] = 100,
     before: Annotated[
         int | None, Query(ge=1, le=2**53, description="`next_before` of the page before.")
@@ -171,7 +170,6 @@ def read_audit(
     ] = None,
 ) -> AuditPage:
     """Return entries of the audit log, newest first."""
-    del caller
     log: AuditLog = request.app.state.audit
     found = log.page(limit=limit + 1, before=before, action=action)
     shown = found[:limit]

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from stillpath.service.security.callers import Caller
 
-__all__ = ["COUNTED", "Limits", "limited_receive", "name_of", "unreadable"]
+__all__ = ["COUNTED", "CallerLimits", "limited_receive", "name_of", "unreadable"]
 
 COUNTED = "stillpath.body_counted"
 """Key of the ASGI scope that a route sets which counts the bytes of its body itself."""
@@ -35,7 +35,7 @@ _MOST_HEADERS = 100
 _LARGEST_DOCUMENT_BYTES = 4 << 20
 
 
-class Limits:
+class CallerLimits:
     """Counts what callers ask of this process.
 
     Requests are counted by a token bucket for each key, or for each address without a valid key;
@@ -46,7 +46,7 @@ class Limits:
     uploads : int
         That one caller may have on their way at once.
     clock : callable
-        Seconds, from anywhere.
+        Monotonic seconds.
     """
 
     def __init__(

@@ -368,7 +368,10 @@ def _expected(store: MachineStore, name: str, if_match: str | None) -> int:
 
 
 def _check_state(store: MachineStore, name: str, if_match: str | None) -> int:
-    """Return the current revision's number if it is the one that If-Match names, if it does."""
+    """Return the number of the current revision.
+
+    Raise `Problem` 412 if `if_match` is given and names another state.
+    """
     _check_own(name)
     current = store.current(name)
     if if_match is not None and not matches(if_match, _etag(current.machine)):

@@ -37,9 +37,8 @@ class PrinterView(BaseModel):
 
 
 @router.get("", responses=responses(401, 403, 429), summary="List the printers")
-def list_printers(request: Request, caller: Reader) -> list[PrinterView]:
+def list_printers(request: Request, _: Reader) -> list[PrinterView]:
     """Return the printers that a job can name."""
-    del caller
     printers: Mapping[str, Printer] = request.app.state.printers
     return [
         PrinterView(
@@ -60,13 +59,12 @@ def list_printers(request: Request, caller: Reader) -> list[PrinterView]:
     responses=responses(401, 403, 404, 422, 424, 429),
     summary="Compare a printer with its machine",
 )
-def check_printer(request: Request, name: Name, caller: Reader) -> PrinterCheck:
+def check_printer(request: Request, name: Name, _: Reader) -> PrinterCheck:
     """Ask a Moonraker printer for its configuration and limits; say where the machine differs.
 
     The first check with a revision of the machine remembers the configuration; later ones tell what
     has changed since.
     """
-    del caller
     return _checked(request, name, accept=False)
 
 
@@ -78,7 +76,7 @@ def check_printer(request: Request, name: Name, caller: Reader) -> PrinterCheck:
 def accept_printer(request: Request, name: Name, caller: Admin) -> PrinterCheck:
     """Remember the current configuration; later checks report changes since then."""
     found = _checked(request, name, accept=True)
-    record(request, caller, "accept", name, machine=found.machine)
+    record(request, caller, "printer.accept", name, machine=found.machine)
     return found
 
 

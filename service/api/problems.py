@@ -206,7 +206,12 @@ _EXAMPLES: dict[int, dict[str, Any]] = {
         problem(401, "Unauthorized", NO_KEY),
         problem(403, "Not allowed", "This needs a key with scope 'admin'."),
         problem(404, "No such job", "There is no job 3f0c. Jobs are gone once they are deleted."),
-        problem(408, "Request Timeout", "Within 30 s less than 1024 bytes of the body came."),
+        problem(
+            408,
+            "Request Timeout",
+            "Fewer than 1024 bytes of the body came within 30 s. Send it again over a better "
+            "connection.",
+        ),
         problem(409, "Job not finished", "The job is running. Ask again when its state is done."),
         problem(412, "Precondition failed", "Machine 'mine' is at \"3f6a\" (revision 4)."),
         problem(413, "File too large", "The upload is larger than 1073741824 bytes."),

@@ -9,7 +9,7 @@ from fastapi import APIRouter, Query, Request
 from starlette.responses import Response
 
 from stillpath.service.api.access import Reader
-from stillpath.service.api.computing import WAITING, ComputeRequest, run_and_wait
+from stillpath.service.api.computing import WAITING, ComputeRequest, lost_answer, run_and_wait
 from stillpath.service.api.file_responses import MEDIA, stored_result
 from stillpath.service.api.job_lookup import JobId, find_done
 from stillpath.service.api.problems import Problem, responses
@@ -81,4 +81,9 @@ async def read_trajectories(
         source_sha256=job.source_sha256,
     )
     made = await run_and_wait(request, caller, asked)
-    return await stored_result(request, made, MEDIA[f".{format}"])
+    try:
+        return await stored_result(request, made, MEDIA[f".{format}"])
+    except Problem as error:
+        if error.document["status"] != 404:
+            raise
+        raise await lost_answer(request, made) from None

@@ -17,6 +17,7 @@ from fastapi import Request
 from stillpath.service.api.forms import broken_form, is_form, read_form
 from stillpath.service.api.limits import COUNTED
 from stillpath.service.api.problems import Problem
+from stillpath.service.jobs.problems import FILE_EMPTY, FILE_TOO_LARGE
 from stillpath.service.storage.disk import Disk
 
 __all__ = [
@@ -110,7 +111,7 @@ async def receive_upload(request: Request, target: Path, *, max_bytes: int, disk
     if sink.size_bytes == 0:
         raise Problem(
             422,
-            "The file is empty",
+            FILE_EMPTY,
             "The file has no content: slice or copy it again. The G-code is the body of the "
             "request (curl --data-binary @part.gcode), or a form's file.",
         )
@@ -253,7 +254,7 @@ def _check_declared(request: Request, max_bytes: int, disk: Disk) -> int:
 def _too_large(max_bytes: int) -> Problem:
     return Problem(
         413,
-        "File too large",
+        FILE_TOO_LARGE,
         f"The upload is larger than {max_bytes} bytes, the limit of this service (of files: "
         "STILLPATH_MAX_UPLOAD_BYTES).",
         headers={"Connection": "close"},

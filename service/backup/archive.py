@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import gzip
 import hashlib
 import io
 import os
@@ -17,6 +18,7 @@ import shutil
 import sqlite3
 import tarfile
 import tempfile
+import zlib
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from typing import IO
@@ -26,6 +28,7 @@ from pydantic import ValidationError
 from stillpath.models.document import Document
 from stillpath.pipeline.files import replacing, sync
 from stillpath.service.instance_lock import exclusive
+from stillpath.service.permissions import private_folder
 from stillpath.version import __version__
 
 __all__ = ["BackupError", "Manifest", "back_up", "restore"]
@@ -34,8 +37,17 @@ DATABASE = "stillpath.sqlite3"
 _MANIFEST = "backup.json"
 _RESTORING = ".restoring"
 _LOCK = "service.lock"
-_PASSING = frozenset({"incoming", "scratch", "cache", "jobs", _LOCK})
-"""What is no data at the top of the directory, and jobs, which the database leads to."""
+_BACKUPS = "backups"
+"""Folder in the data directory for backups on the same disk, from where they are fetched."""
+_PASSING = frozenset(
+    {"incoming", "scratch", "cache", "jobs", "first-key", "disk-reserve", _BACKUPS, _LOCK}
+)
+"""What is no data at the top of the directory, a secret, or led to by the database (jobs)."""
+_DAMAGES = (
+    *(tarfile.TarError, gzip.BadGzipFile, zlib.error),
+    *(EOFError, ValidationError, UnicodeError),
+)
+"""What reading a damaged archive raises."""
 _CHUNK_BYTES = 1 << 20
 
 
@@ -62,7 +74,8 @@ def back_up(data_dir: Path, target: Path) -> Manifest:
     Parameters
     ----------
     target : Path
-        A new file; compressed if its name ends with ``gz``.
+        A new file that only its owner may read; compressed if its name ends with ``gz``. In the
+        data directory only below ``backups``, which is made if need be.
 
     Raises
     ------
@@ -73,11 +86,16 @@ def back_up(data_dir: Path, target: Path) -> Manifest:
     if target.exists():
         raise BackupError(f"{target} already exists; name a new file")
     if target.resolve().is_relative_to(data_dir.resolve()):
-        raise BackupError(f"{target} lies in the data directory; name a file elsewhere")
+        if not target.resolve().is_relative_to(data_dir.resolve() / _BACKUPS):
+            raise BackupError(
+                f"{target} lies in the data directory; name a file elsewhere, or in "
+                f"{data_dir / _BACKUPS}"
+            )
+        private_folder(target.parent)
     if (data_dir / _RESTORING).exists():
         raise BackupError(f"{data_dir}: a restore was broken off there; finish it first")
     with (
-        replacing(target) as temporary,
+        replacing(target, mode=0o600) as temporary,
         tempfile.TemporaryDirectory(dir=target.parent, prefix=".backup-") as work,
         tarfile.open(
             temporary, "w:gz" if target.name.endswith("gz") else "w", format=tarfile.PAX_FORMAT
@@ -180,10 +198,13 @@ def _add_jobs(archive: _Archive, data_dir: Path, copy: Path) -> int:
         live.backup(taken)
         taken.execute("PRAGMA journal_mode = DELETE").fetchone()
         taken.execute("PRAGMA foreign_keys = ON").close()
-        rows = taken.execute("SELECT id, state, output FROM jobs").fetchall()
+        rows = taken.execute("SELECT id, state, source_bytes, output FROM jobs").fetchall()
         gone = []
-        for job_id, state, output in rows:
-            names = _add_job(archive, data_dir, job_id, output)
+        for job_id, state, upload_bytes, output in rows:
+            folder = data_dir / "jobs" / job_id
+            needed = [folder / "source"] if upload_bytes else []
+            needed += [data_dir / output] if output else []
+            names = _add_job(archive, data_dir, folder, needed)
             # Rows are deleted before their files: what has a row still was whole.
             still = live.execute("SELECT 1 FROM jobs WHERE id = ?", (job_id,)).fetchone()
             if still is None or (names is None and state not in ("failed", "cancelled")):
@@ -196,19 +217,18 @@ def _add_jobs(archive: _Archive, data_dir: Path, copy: Path) -> int:
 
 
 def _add_job(
-    archive: _Archive, data_dir: Path, job_id: str, output: str | None
+    archive: _Archive, data_dir: Path, folder: Path, needed: list[Path]
 ) -> list[str] | None:
     """Add the files of a job and return their names; None, and nothing added, if some are gone."""
-    folder = data_dir / "jobs" / job_id
     added: list[str] = []
     try:
-        paths = _below(folder / "source")
-        if not paths:
-            raise FileNotFoundError(errno.ENOENT, "the upload is gone", str(folder))
-        if (folder / "machine.json").exists():  # jobs of the first version had none
+        paths = set()
+        for part in needed:
+            if not (found := _below(part)):
+                raise FileNotFoundError(errno.ENOENT, "the files are gone", str(part))
+            paths |= found
+        if (folder / "machine.json").exists():  # not every kind of job has one
             paths.add(folder / "machine.json")
-        if output:
-            paths |= _below(data_dir / output)
         for path in sorted(paths):
             name = path.relative_to(data_dir).as_posix()
             archive.add(name, path)
@@ -248,7 +268,7 @@ def _unpack(source: Path, folder: Path) -> Manifest:
                     manifest = Manifest.model_validate_json(content.read())
                 else:
                     found[entry.name] = _write(folder / entry.name, content)
-    except (tarfile.TarError, EOFError, ValidationError, UnicodeError) as error:
+    except _DAMAGES as error:
         raise BackupError(f"{source} is damaged ({_first_line(error)}); take another") from None
     if manifest is None:
         raise BackupError(

@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 _T = TypeVar("_T")
 
 __all__ = [
+    "SQLITE_FILE",
     "DatabaseAway",
     "DatabaseFull",
     "StoreError",
@@ -52,7 +53,8 @@ __all__ = [
     "writing",
 ]
 
-_FILE = "stillpath.sqlite3"
+SQLITE_FILE = "stillpath.sqlite3"
+"""In the data directory."""
 _BUSY_TIMEOUT_MS = 30_000
 _AGAIN_S = 0.02
 _OPENED = "stillpath_opened"
@@ -94,7 +96,7 @@ def database_url(settings: Settings) -> URL:
         If it is neither SQLite nor PostgreSQL.
     """
     if settings.database_url is None:
-        return URL.create("sqlite", database=str(Path(settings.data_dir) / _FILE))
+        return URL.create("sqlite", database=str(Path(settings.data_dir) / SQLITE_FILE))
     try:
         url = make_url(settings.database_url)
     except ArgumentError:
@@ -159,12 +161,12 @@ def make_engine(url: URL, *, pooled: bool = True) -> Engine:
 
 
 def migrate(engine: Engine, *, before_making: Callable[[], None] = lambda: None) -> None:
-    """Bring the schema to that of this version, in one transaction, beside others who do so.
+    """Migrate the schema to this version in one transaction, also if several processes do so.
 
     Parameters
     ----------
     before_making : callable
-        Called where there are no tables; may raise to leave it at that.
+        Called where there are no tables; may raise to prevent the creation of the tables.
 
     Raises
     ------

@@ -25,7 +25,7 @@ from stillpath.models.errors import ModelError
 from stillpath.models.firmware import Klipper
 from stillpath.models.machine import Machine
 from stillpath.service.deliveries.http_requests import Unanswered, Unreached
-from stillpath.service.deliveries.moonraker import Asked, NotReady, ask
+from stillpath.service.deliveries.moonraker import NotReady, PrinterState, ask
 from stillpath.service.deliveries.printers import Printer
 from stillpath.service.deliveries.targets import TargetRefused
 
@@ -112,7 +112,7 @@ class PrinterCheck(BaseModel):
     remembered_at : datetime
         Of the configuration that later ones are compared with.
     findings : list of Finding
-        Empty: nothing speaks against it.
+        Empty if the printer fits its machine.
     """
 
     printer: str
@@ -161,15 +161,15 @@ class Checker:
         printer: Printer,
         machine: Machine,
         *,
-        method: str = DEFAULT_METHOD,
+        method: str | None = None,
         accept: bool = False,
     ) -> PrinterCheck:
         """Ask a printer and compare it with the machine that files for it are made with.
 
         Parameters
         ----------
-        method : str
-            Of the file; those without a stream need no raised limits.
+        method : str, optional
+            Of the file, otherwise the printer's; those without a stream need no raised limits.
         accept : bool
             Remember the configuration as it is now, whatever it was before.
 
@@ -187,7 +187,7 @@ class Checker:
             asked = ask(printer)
         except (Unreached, Unanswered, TargetRefused, NotReady) as error:
             raise PrinterUnknown(f"{printer.name} cannot be asked: {error}") from error
-        found = findings(machine, asked, method=method)
+        found = findings(machine, asked, method=method or printer.method or DEFAULT_METHOD)
         now = _Remembered(
             printer=printer.name,
             machine=machine.name,
@@ -246,7 +246,9 @@ class Checker:
             ) from None
 
 
-def findings(machine: Machine, asked: Asked, *, method: str = DEFAULT_METHOD) -> list[Finding]:
+def findings(
+    machine: Machine, asked: PrinterState, *, method: str = DEFAULT_METHOD
+) -> list[Finding]:
     """Return findings against printing a machine's file on a printer, unsafe ones first."""
     firmware = machine.firmware
     if not isinstance(firmware, Klipper):
@@ -267,7 +269,7 @@ def findings(machine: Machine, asked: Asked, *, method: str = DEFAULT_METHOD) ->
     return sorted(found, key=lambda finding: not finding.unsafe)
 
 
-def relevant(asked: Asked) -> dict[str, dict[str, Any]]:
+def relevant(asked: PrinterState) -> dict[str, dict[str, Any]]:
     """Return of a configuration what changes motion or vibration, by section and option."""
     found: dict[str, dict[str, Any]] = {}
     for section, options in sorted(asked.settings.items()):
@@ -286,7 +288,7 @@ def relevant(asked: Asked) -> dict[str, dict[str, Any]]:
     return found
 
 
-def _differences(machine: Machine, asked: Asked) -> Iterator[Finding]:
+def _differences(machine: Machine, asked: PrinterState) -> Iterator[Finding]:
     """Compare the configuration with the document, option by option."""
     try:
         found = differences(machine, asked.config())
@@ -309,7 +311,7 @@ def _differences(machine: Machine, asked: Asked) -> Iterator[Finding]:
         )
 
 
-def _in_force(machine: Machine, asked: Asked) -> Iterator[Finding]:
+def _in_force(machine: Machine, asked: PrinterState) -> Iterator[Finding]:
     """Compare what is in force with the configuration, unless a print may have changed it."""
     if asked.prints:
         return
@@ -337,7 +339,7 @@ def _in_force(machine: Machine, asked: Asked) -> Iterator[Finding]:
         yield Finding(place="pressure_advance", machine=stated, printer=advance, text=text)
 
 
-def _commands(machine: Machine, asked: Asked) -> Iterator[Finding]:
+def _commands(machine: Machine, asked: PrinterState) -> Iterator[Finding]:
     """Find macros that stand in the way of what a stream sets."""
     from stillpath.gcode.firmware.registry import adapter  # heavy
 
@@ -361,7 +363,7 @@ def _commands(machine: Machine, asked: Asked) -> Iterator[Finding]:
         yield Finding(place="SET_INPUT_SHAPER", text=text)
 
 
-def _wrappers(asked: Asked) -> Iterator[Finding]:
+def _wrappers(asked: PrinterState) -> Iterator[Finding]:
     """Find commands that would run under a stream's limits."""
     missing = list(_unwrapped(asked))
     if not missing:
@@ -377,7 +379,7 @@ def _wrappers(asked: Asked) -> Iterator[Finding]:
     yield Finding(place=names, text=text)
 
 
-def _kept_shaper(asked: Asked, *, streams: bool) -> Iterator[Finding]:
+def _kept_shaper(asked: PrinterState, *, streams: bool) -> Iterator[Finding]:
     """Find a Klipper that does not switch its shaper off, nor set its frequency."""
     shaper = asked.settings.get("input_shaper")
     if shaper is None or not ignores_shaper_frequencies(asked.software):
@@ -397,7 +399,7 @@ def _kept_shaper(asked: Asked, *, streams: bool) -> Iterator[Finding]:
     yield Finding(place="SET_INPUT_SHAPER", printer=asked.software, unsafe=streams, text=text)
 
 
-def _no_shaper(asked: Asked) -> Iterator[Finding]:
+def _no_shaper(asked: PrinterState) -> Iterator[Finding]:
     """Find that the shaper cannot be set."""
     if "input_shaper" not in asked.settings:
         text = (
@@ -408,7 +410,7 @@ def _no_shaper(asked: Asked) -> Iterator[Finding]:
         yield Finding(place="[input_shaper]", text=text)
 
 
-def _unwrapped(asked: Asked) -> Iterable[str]:
+def _unwrapped(asked: PrinterState) -> Iterable[str]:
     if asked.commands is None:
         # Of macros of one name the last one counts.
         last = {name.upper(): name for name in asked.sections}
@@ -422,7 +424,7 @@ def _unwrapped(asked: Asked) -> Iterable[str]:
     return [name for name in looked_for if not known.get(name, "").startswith(_OURS)]
 
 
-def _changes(known: _Remembered, asked: Asked) -> Iterator[Finding]:
+def _changes(known: _Remembered, asked: PrinterState) -> Iterator[Finding]:
     """Compare with what was remembered."""
     now = relevant(asked)
     day = known.when.astimezone().strftime("%Y-%m-%d")

@@ -57,11 +57,11 @@ def post(
     ----------
     headers : mapping
     content : bytes, optional
-        The body; or else a form of
+        The body, unless a form is sent.
     fields : mapping, optional
-        and
+        Text fields of the form; used only with `file`.
     file : tuple of (name, open file), optional
-        which is streamed.
+        Name and open file of the form's file part; streamed.
     loopback : bool
         Whether the target may be this computer though its name does not say so.
     timeout_s : float

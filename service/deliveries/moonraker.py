@@ -17,7 +17,7 @@ from stillpath.service.deliveries.http_requests import Unanswered, get
 from stillpath.service.deliveries.printers import Printer
 from stillpath.service.deliveries.targets import read_url
 
-__all__ = ["Asked", "NotReady", "ask"]
+__all__ = ["NotReady", "PrinterState", "ask"]
 
 _LONGEST_BYTES = 8 << 20
 _TIMEOUT_S = 5.0
@@ -32,7 +32,7 @@ class NotReady(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class PrinterState:
     """A printer as it is now.
 
     Attributes
@@ -76,7 +76,7 @@ class Asked:
         return PrinterConfig("printer.cfg", sections)
 
 
-def ask(printer: Printer) -> Asked:
+def ask(printer: Printer) -> PrinterState:
     """Ask a printer's Moonraker.
 
     Raises
@@ -100,7 +100,7 @@ def ask(printer: Printer) -> Asked:
     if "printer" not in settings:
         raise Unanswered("Moonraker does not tell printer.cfg: its answer has no [printer]")
     commands = gcode.get("commands")
-    return Asked(
+    return PrinterState(
         software=str(info.get("software_version", "")),
         settings=settings,
         sections=tuple(map(str, _part(config, "config"))),

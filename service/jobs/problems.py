@@ -9,6 +9,9 @@ from stillpath.service.jobs.state import JobKind
 from stillpath.service.storage.disk import DISK_FULL
 
 __all__ = [
+    "FILE_EMPTY",
+    "FILE_TITLES",
+    "FILE_TOO_LARGE",
     "PROBLEM_MEDIA_TYPE",
     "input_damaged",
     "input_gone",
@@ -20,6 +23,11 @@ __all__ = [
 ]
 
 PROBLEM_MEDIA_TYPE = "application/problem+json"
+FILE_EMPTY = "The file is empty"
+FILE_TOO_LARGE = "File too large"
+_GCODE_REFUSED = "The G-code cannot be processed"
+FILE_TITLES = frozenset({FILE_EMPTY, FILE_TOO_LARGE, _GCODE_REFUSED})
+"""Titles of problems (4xx) for which the uploaded file is to blame, and nothing else."""
 _REFUSED = {
     JobKind.TRAJECTORIES: "Trajectories not available",
     JobKind.IDENTIFICATION: "Identification not possible",
@@ -64,7 +72,7 @@ def problem_of(error: BaseException, kind: JobKind = JobKind.COMPENSATION) -> di
             return problem(422, _REFUSED[kind], str(error), **extra)
         case GcodeError():
             place = {} if error.line is None else {"line": error.line, "text": error.text}
-            return problem(422, "The G-code cannot be processed", str(error), **place)
+            return problem(422, _GCODE_REFUSED, str(error), **place)
         case ModelError():
             return problem(422, "The machine model cannot be used", str(error))
         case DesignError():
@@ -84,7 +92,7 @@ def problem_of(error: BaseException, kind: JobKind = JobKind.COMPENSATION) -> di
         case OSError(errno=errno.EFBIG):
             return problem(
                 507,
-                "File too large",
+                FILE_TOO_LARGE,
                 "A file of the job became larger than the file system of the data directory or of "
                 "the storage allows. Cut the print into several files.",
             )

@@ -136,7 +136,7 @@ class Reconciler:
             try:
                 self._tick()
             except (DatabaseAway, ClusterAway) as error:
-                self._say(str(error))
+                self._set_trouble(str(error))
                 if isinstance(error, DatabaseAway) and self._disk.is_full:
                     self._disk.give_up()  # jobs wait; the reserve lets their states be written
                 self.slots = 0
@@ -165,7 +165,7 @@ class Reconciler:
             if self._stopping.is_set():
                 return  # connecting may take long; do not start workers during a shutdown
         self.slots = self._cluster.slots()
-        self._say(None if self.slots else "no worker is connected to the scheduler")
+        self._set_trouble(None if self.slots else "no worker is connected to the scheduler")
         self._renew()
         if not self._has_lease:
             self._free = 0
@@ -235,7 +235,11 @@ class Reconciler:
                     self._give_back(job_id, row.attempt, _reason(future))
             elif row is not None and row.state is JobState.QUEUED and row.attempt == job.attempt:
                 unclaimed = True
-                self._log.warning("not even begun", job=job_id, reason=_reason(future))
+                self._log.warning(
+                    "the task ended before a worker claimed the job; it is submitted again",
+                    job=job_id,
+                    reason=_reason(future),
+                )
             del self._in_flight[job_id]
             self._broken_since.pop(job_id, None)
         if unclaimed:
@@ -265,7 +269,7 @@ class Reconciler:
         left_alone = [job_id for job_id, (_, until) in self._no_room.items() if until > now]
         exclude = [*self._in_flight, *left_alone]
         for job in self._store.next_queued(most, short=short, exclude=exclude):
-            if job.waits_for_room and not self._may_try_again(job, now):
+            if job.waits_for_room and not self._may_retry_for_room(job, now):
                 continue
             self._in_flight[job.id] = (job, self._cluster.submit(job, self._wake.set))
             begun += 1
@@ -283,7 +287,7 @@ class Reconciler:
                 self._log.warning("jobs wait for room on the disk", free_mib=free_mib)
         return has_room
 
-    def _may_try_again(self, job: Job, now: float) -> bool:
+    def _may_retry_for_room(self, job: Job, now: float) -> bool:
         """Return whether a job whose files had no room may be tried again.
 
         With our own workers, whose disk is known here, it waits until there is enough room.
@@ -315,12 +319,12 @@ class Reconciler:
                 "worker lost", job=job_id, attempt=attempt, reason=reason, now=after.state.value
             )
 
-    def _say(self, trouble: str | None) -> None:
+    def _set_trouble(self, trouble: str | None) -> None:
         if trouble is None and self._trouble is not None:
-            self._log.info("jobs are done", workers=self.slots)
+            self._log.info("jobs are processed again", workers=self.slots)
         elif trouble is not None and self._trouble is None:
             self._trouble_since = time.monotonic()
-            self._log.warning("no jobs are done", reason=trouble)
+            self._log.warning("no jobs are processed", reason=trouble)
         self._trouble = trouble
 
     # The second thread, for slow work

@@ -33,7 +33,7 @@ __all__ = [
     "JobKind",
     "JobState",
     "Lost",
-    "NoRoom",
+    "OutOfRoom",
     "Progressed",
     "Stale",
     "advance",
@@ -245,8 +245,9 @@ class Failed:
 class Lost:
     """The worker died, or the service stopped, in the middle of the job.
 
-    `blame` says whether the job may be the cause (not if the service was stopped). `problem` is
-    what the job finally fails with, if more is known than that its worker is gone.
+    `max_attempts` is the number of losses with which the job fails; `blame` says whether it may be
+    the cause (not if the service was stopped). `problem` is what the job finally fails with, if
+    more is known than that its worker is gone.
     """
 
     attempt: int
@@ -258,7 +259,7 @@ class Lost:
 
 
 @dataclass(frozen=True, slots=True)
-class NoRoom:
+class OutOfRoom:
     """The disk is full, or nearly: the job waits until there is room again.
 
     `room_bytes` is the least that it needs: what it had written when it was stopped.
@@ -276,7 +277,7 @@ class Cancelled:
     at: float
 
 
-Event = Claimed | Progressed | Finished | Failed | Lost | NoRoom | Cancelled
+Event = Claimed | Progressed | Finished | Failed | Lost | OutOfRoom | Cancelled
 
 
 class Stale(Exception):
@@ -324,7 +325,7 @@ def advance(job: Job, event: Event) -> Job:
             )
         case Failed():
             return _failed(job, event.problem, event.at)
-        case NoRoom():
+        case OutOfRoom():
             room_bytes = max(job.room_bytes or 0, event.room_bytes)
             return replace(_waiting(job), stage=WAITING_FOR_ROOM, room_bytes=room_bytes)
         case Lost():

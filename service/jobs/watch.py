@@ -19,11 +19,11 @@ import structlog
 from stillpath.pipeline.progress import Cancelled, Progress
 from stillpath.service.database.engine import DatabaseAway
 from stillpath.service.jobs.problems import problem
-from stillpath.service.jobs.state import Event, Failed, Job, JobKind, Lost, NoRoom
+from stillpath.service.jobs.state import Event, Failed, Job, JobKind, Lost, OutOfRoom
 from stillpath.service.jobs.store import JobStore
 from stillpath.service.settings import Settings
 
-__all__ = ["STUCK_EXIT_CODE", "Limits", "Watch", "held_bytes"]
+__all__ = ["STUCK_EXIT_CODE", "AttemptLimits", "Watch", "held_bytes"]
 
 STUCK_EXIT_CODE = 70
 _BEAT_S = 0.5
@@ -40,7 +40,7 @@ _SHORT_REMEDIES = {
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class AttemptLimits:
     """Limits of an attempt, and the settings that define them (`service.settings.Settings`)."""
 
     max_s: float
@@ -112,7 +112,7 @@ class Watch:
         self,
         store: JobStore,
         job: Job,
-        limits: Limits,
+        limits: AttemptLimits,
         *,
         interrupted: Callable[[], str | None],
         has_room: Callable[[], bool] = lambda: True,
@@ -124,7 +124,7 @@ class Watch:
         self._limits = limits
         self._interrupted = interrupted
         self._has_room = has_room
-        self._no_room = no_room or (lambda: NoRoom(job.attempt, time.time()))
+        self._no_room = no_room or (lambda: OutOfRoom(job.attempt, time.time()))
         self._end = end
         self._began = time.monotonic()
         self._latest = Progress("starting", 0.0, 0.0, 0.0, None)

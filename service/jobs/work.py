@@ -10,10 +10,10 @@ from stillpath.service.jobs.worker import run_compensation
 from stillpath.service.settings import Settings
 from stillpath.service.storage import Storage
 
-__all__ = ["Work"]
+__all__ = ["JobRunner"]
 
 
-class Work:
+class JobRunner:
     """Gets the jobs of a store done.
 
     Parameters
@@ -45,7 +45,7 @@ class Work:
         self._reconciler.leave()
 
     def notify(self) -> None:
-        """Notify that a job was added or removed."""
+        """Wake the reconciler: a job was added or removed."""
         self._reconciler.notify()
 
     @property

@@ -35,10 +35,10 @@ from stillpath.service.jobs.problems import (
     storage_away,
     storage_never_fits,
 )
-from stillpath.service.jobs.state import Event, Failed, Finished, Job, JobKind, Lost, NoRoom
+from stillpath.service.jobs.state import Event, Failed, Finished, Job, JobKind, Lost, OutOfRoom
 from stillpath.service.jobs.store import JobStore
 from stillpath.service.jobs.task import Runner, Task
-from stillpath.service.jobs.watch import Limits, Watch, held_bytes
+from stillpath.service.jobs.watch import AttemptLimits, Watch, held_bytes
 from stillpath.service.logs import configure_logging
 from stillpath.service.processes import limit_memory
 from stillpath.service.settings import Settings
@@ -127,7 +127,7 @@ def execute(job_id: str, workplace: Workplace, runner: Runner) -> None:
         return
     log = structlog.get_logger("worker")
     settings = workplace.settings
-    limits = Limits.of(job.kind, settings)
+    limits = AttemptLimits.of(job.kind, settings)
     # The watch checks periodically; this limit acts in between, and includes freed memory.
     limit_memory(limits.max_bytes + max(limits.max_bytes // 4, _KEPT_BYTES))
     if job.kind is not JobKind.COMPENSATION:
@@ -191,7 +191,7 @@ def run_compensation(task: Task, progress: Callable[[Progress], None]) -> dict[s
 
 
 def _attempt(
-    job: Job, workplace: Workplace, runner: Runner, watch: Watch, limits: Limits
+    job: Job, workplace: Workplace, runner: Runner, watch: Watch, limits: AttemptLimits
 ) -> Event | None:
     """Return how the attempt ended; None if it was stopped from outside.
 
@@ -218,7 +218,7 @@ def _attempt(
         return Failed(job.attempt, time.time(), error.problem)
     except OSError as error:
         if error.errno in DISK_FULL:
-            return NoRoom(job.attempt, time.time())  # not even for its folder
+            return OutOfRoom(job.attempt, time.time())  # not even for its folder
         _log_crash()
         if isinstance(error, StorageError):
             # Another worker, or a later attempt, may succeed.
@@ -242,7 +242,7 @@ def _no_room(job: Job, workplace: Workplace) -> Event:
     disk = Disk(workplace.settings.data_dir, workplace.settings.disk_reserve_bytes)
     written = _written_bytes(job, workplace)
     if disk.fits_ever(written + job.source_bytes):
-        return NoRoom(job.attempt, time.time(), written)
+        return OutOfRoom(job.attempt, time.time(), written)
     return Failed(job.attempt, time.time(), never_fits(written, disk.total_bytes()))
 
 
@@ -256,7 +256,7 @@ def _no_room_in_storage(job: Job, workplace: Workplace) -> Event:
         room = workplace.storage.room()
     if room is not None and needed + job.source_bytes > room.total_bytes:
         return Failed(job.attempt, time.time(), storage_never_fits(needed, room.total_bytes))
-    return NoRoom(job.attempt, time.time(), needed)
+    return OutOfRoom(job.attempt, time.time(), needed)
 
 
 def _written_bytes(job: Job, workplace: Workplace) -> int:

@@ -42,8 +42,8 @@ class AuditEntry:
     remote : str or None
         Address of the other side.
     action : str
-        For instance ``submit``, ``cancel``, ``delete``, ``machine.change``, ``key.revoke``,
-        ``denied``.
+        For instance ``submit``, ``cancel``, ``delete``, ``machine.change``, ``printer.accept``,
+        ``key.revoke``, ``denied``.
     subject : str or None
         What it was done to: the id of a job or key, the name of a machine, a route.
     details : dict

@@ -67,7 +67,7 @@ def test_an_end_leaves_nothing_but_logs(tmp_path: Path, how: signal.Signals) -> 
             stderr=file,
             env=os.environ | {"PYTHONPATH": str(ROOT)},
         )
-        until(lambda: "jobs are done" in said.read_text(), 60)
+        until(lambda: "jobs are processed again" in said.read_text(), 60)
         family = psutil.Process(process.pid).children(recursive=True)
         assert family
         process.send_signal(how)

@@ -2,14 +2,17 @@
 
 What is odd is told by the beginning of the path: /key wants the key "secret", with /short results
 break off, with /login a page comes instead of them, with /lost a part of the upload gets lost,
-/moved is somewhere else. All other paths are those of the real server.
+/moved is somewhere else, /full takes no uploads, /busy takes each only the second time, /damaged
+has damaged results, /unreported no reports. All other paths are those of the real server.
 """
 
 import json
 import sys
 from pathlib import Path
 
-ODDITIES = ("key", "short", "login", "lost", "moved")
+ODDITIES = ("key", "short", "login", "lost", "moved", "full", "busy", "damaged", "unreported")
+KEYS = set()
+"""Of uploads that came to /busy."""
 
 
 def odd(app):
@@ -25,12 +28,27 @@ def odd(app):
             await answer(send, 401, {"detail": "This key is unknown here."})
         elif oddity == "moved":
             await answer(send, 308, {}, (b"location", b"http://elsewhere.invalid/"))
+        elif oddity == "full" and path == "v1/jobs":
+            await answer(send, 429, {"detail": "'ada' has 1000 unfinished jobs."})
+        elif oddity == "busy" and path == "v1/jobs" and is_new(dict(headers)[b"idempotency-key"]):
+            await answer(send, 408, {"detail": "Too slow."}, (b"retry-after", b"1"))
+        elif oddity == "damaged" and path.endswith("/result"):
+            document = {"title": "The file is damaged", "detail": "The result is damaged."}
+            await answer(send, 404, document)
+        elif oddity == "unreported" and "/report" in path:
+            await answer(send, 404, {"title": "The file is gone", "detail": "The report is gone."})
         elif oddity == "login" and path.endswith("/result"):
             await answer(send, 200, {}, (b"content-type", b"text/html"))
         else:
             await app(scope, receive, Changed(send, scope["path"], oddity))
 
     return application
+
+
+def is_new(key):
+    known = key in KEYS
+    KEYS.add(key)
+    return not known
 
 
 class Changed:

@@ -146,6 +146,16 @@ def test_a_report_that_cannot_be_written_stops_nothing(cura: Cura, script: Any, 
     assert cura.shown[-1][0] == "POSITIVE", cura.shown
 
 
+def test_a_report_that_does_not_come_stops_nothing(
+    cura: Cura, script: Any, address: str, tmp_path: Path
+):
+    script.values |= {"server": f"{address}/unreported", "reports": str(tmp_path)}
+    made = cura.write_started([script], list(LAYERS))
+    assert made[0].startswith("; compensated\n")
+    assert cura.shown[-1][0] == "POSITIVE", cura.shown
+    assert "Report: none (The report is gone.)" in cura.shown[-1][1]
+
+
 def test_settings_that_cura_read_back_are_text(cura: Cura, script: Any):
     script.values |= {key: str(value) for key, value in script.values.items()}
     script.values["tolerance_um"] = "2,5"

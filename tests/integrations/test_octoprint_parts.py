@@ -285,6 +285,14 @@ def test_what_is_wrong_is_said(bench: Any, address: str, more: dict, machine: st
     assert (here.files / "a.gcode").read_text() == "G1 X3\n"
 
 
+def test_a_result_without_its_report(bench: Callable[..., Bench], address: str):
+    here = bench(address=f"{address}/unreported")
+    entry = here.ended(here.add("a.gcode", "G1 X6\n"))
+    assert entry.state == "done", entry
+    assert "warning: no report: The report is gone." in entry.message
+    assert (here.files / "a.sp.gcode").read_text() == "; compensated\nG1 X6\n"
+
+
 def test_a_file_that_changes_or_goes_meanwhile(bench: Callable[..., Bench]):
     here = bench()
     here.wait_for = "a print"

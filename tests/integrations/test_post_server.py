@@ -285,6 +285,8 @@ def test_keys(running: Running, part: Path, tmp_path: Path):
         ("login", 1, "bytes came"),
         ("lost", 1, "arrived"),
         ("moved", 2, "http://elsewhere.invalid/"),
+        ("full", 1, "/full could not take the request: 'ada' has 1000 unfinished jobs."),
+        ("damaged", 2, "The result is damaged."),
     ],
 )
 def test_broken_transfers(
@@ -303,8 +305,25 @@ def test_broken_transfers(
     assert said.startswith("stillpath-post: ")
     assert said.count("\n") == 1
     assert word in said
+    assert "cancelled" not in said
     assert_untouched(part)
     until(lambda: not running.job_ids())
+
+
+def test_a_busy_server_is_asked_again(running: Running, part: Path, tmp_path: Path):
+    done = post(*running.odd("busy"), "--no-report", part, home=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert part.read_bytes() == DONE
+
+
+def test_a_result_without_its_report(running: Running, part: Path, tmp_path: Path):
+    done = post(*running.odd("unreported"), part, home=tmp_path)
+    assert_reason(done, 0, "warning: no report: The report is gone.")
+    assert_untouched(part, DONE)
+    part.write_bytes(TEXT)
+    done = post(*running.odd("unreported"), "--no-report", part, home=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert_untouched(part, DONE)
 
 
 def test_a_long_upload_that_breaks_off_is_sent_again(tmp_path: Path):

@@ -158,8 +158,14 @@ def test_the_plain_reader_agrees_with_the_library(tmp_path: Path):
         re.sub('(?m)^# (?=[a-z"].*= )', "", stillpath_post.TEMPLATE),
     ):
         assert stillpath_post._plain_toml(text, tmp_path) == tomllib.loads(text)
-    with pytest.raises(Failure, match="line 2: cannot be read: x = "):
-        stillpath_post._plain_toml("a = 1\nx = {b = 1}\n", tmp_path)
+    for wrong in (
+        "x = {b = 1}",
+        'log = "C:\\Users\\me\\x.log"',
+        "timeout = 007",
+        '[machines]\n"MK4" = "mine"',
+    ):
+        with pytest.raises(Failure, match=r"line [23]: cannot be read: .* single quotes"):
+            stillpath_post._plain_toml(f"machines = 1\n{wrong}\n", tmp_path)
 
 
 def test_the_command_line_counts_more_than_the_settings(tmp_path: Path, monkeypatch):
@@ -181,7 +187,8 @@ def test_the_command_line_counts_more_than_the_settings(tmp_path: Path, monkeypa
     [
         ("servr = 'x'", ("servr", "server")),
         ("timeout = 'x'", ("timeout", "type")),
-        ("timeout = 0", ("timeout", "positive")),
+        ("timeout = 0", ("timeout is 0 s", "more than 0")),
+        ("timeout = 1e8", ("timeout is 1e+08 s", "less than 10000000 s")),
         ("machines = 3", ("machines",)),
         ("on_error = 'maybe'", ("on_error", "keep")),
         ("a = \n", ("line 1",)),
@@ -192,6 +199,15 @@ def test_bad_settings_are_named(tmp_path: Path, text: str, words: tuple[str, ...
         settings(tmp_path, text)
     for word in words:
         assert word in str(caught.value)
+
+
+@pytest.mark.parametrize("wrong", ["wait = 0", "timeout = 'x'", "servr = 'x'"])
+def test_keeping_counts_for_wrong_settings_too(tmp_path: Path, wrong: str):
+    (tmp_path / "post.toml").write_text(f'{wrong}\non-error = "keep"\n')
+    (tmp_path / "x.gcode").write_text("G28\n")
+    done = post("--config", "post.toml", "x.gcode", home=tmp_path)
+    assert done.returncode == 0
+    assert "NOT compensated" in done.stderr
 
 
 @pytest.mark.parametrize(

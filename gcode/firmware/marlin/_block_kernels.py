@@ -3,7 +3,7 @@
 A block is a row of one array (``Q_`` columns). What one block hands to the next (position in
 steps, direction, speeds) lives in the ``S_`` entries of a state vector. Everything is float64;
 the firmware computes in float32, so a rate that lies within some thousandths of a whole number of
-steps per second may come out one step per second off.
+steps per second may come out one step per second off. A 2 at the end of a name means squared.
 
 Rules: Marlin/src/module/planner.cpp, `_populate_block`: release 2.0.8 (2021-05), release 2.1.2.5
 (2024-11), bugfix-2.1.x as of 2025-09; docs/marlin.md says what differs.

@@ -104,7 +104,8 @@ class OnServer(Service):
         tell: Callable[[str, float | None], object],
         note: Callable[..., object],
     ) -> None:
-        super().__init__(entry.server, key, timeout_s, tell)
+        self._unreported: list[str] = []
+        super().__init__(entry.server, key, timeout_s, tell, self._unreported.append)
         self._entry, self._note = entry, note
 
     def run(self, source: Path, folder: Path, name: str) -> Made:
@@ -128,8 +129,10 @@ class OnServer(Service):
             self._submit(source, name)
         target = folder / f"result{source.suffix}"
         self._fetch(self._path, self._wait(self._path, None), target)
-        page = self._ask("GET", f"{self._path}/report", self._timeout_s)
-        return Made(target, page, self._figures())
+        made = Made(target, self._report(f"{self._path}/report"), self._figures())
+        if self._unreported:
+            made.figures["warnings"] = [f"no report: {self._unreported[0]}", *made.warnings]
+        return made
 
     def cancel(self) -> None:
         """Stop the job, if it is there and nobody else's; errors do not matter any more."""
@@ -181,7 +184,7 @@ class OnServer(Service):
         # Sent twice after a lost answer, or by an OctoPrint that was restarted: one job.
         key = f"{self._entry.id}-{self._entry.tries}"
         options = {"machine": self._entry.machine, **self._entry.options, "name": name}
-        job, is_new = self._upload(source, options, key, self._timeout_s)
+        job, is_new = self._upload(source, options, key)
         self._note(job=job["id"], is_ours=is_new)
         if job.get("source_bytes") != source.stat().st_size:
             self.cancel()
@@ -189,7 +192,7 @@ class OnServer(Service):
 
     def _figures(self) -> dict[str, Any]:
         try:
-            found = json.loads(self._ask("GET", f"{self._path}/report.json", self._timeout_s))
+            found = json.loads(self._report(f"{self._path}/report.json"))
         except ValueError:
             found = None
         return found if isinstance(found, dict) else {}

@@ -2,13 +2,27 @@
 
 from __future__ import annotations
 
+import errno
 import json
 from pathlib import Path
 
 import pytest
 
 from stillpath.applications.machines.store import MachineStore
+from stillpath.cli.batch.server import _failure_of
 from stillpath.cli.main import run
+from stillpath.compensation.base import DesignError
+from stillpath.gcode.errors import GcodeError
+from stillpath.models.errors import ModelError
+from stillpath.service.client import ClientError
+from stillpath.service.jobs.problems import (
+    FILE_EMPTY,
+    FILE_TOO_LARGE,
+    input_damaged,
+    input_gone,
+    problem,
+    problem_of,
+)
 from tests.service.machines import make_machine, with_accel
 from tests.service.test_server import PRETEND, server
 
@@ -72,6 +86,30 @@ def test_a_batch_through_a_server(tmp_path, monkeypatch):
         assert batch("mine") == 0
         assert batch("nobodys") == 2
         assert "no machine nobodys" in rows(output)["a"]["error"]
+
+
+@pytest.mark.parametrize(
+    ("problem", "trouble"),
+    [
+        (problem_of(GcodeError("line 3")), "file"),
+        (problem(422, FILE_EMPTY, ""), "file"),
+        (problem(413, FILE_TOO_LARGE, ""), "file"),
+        (problem_of(OSError(errno.EFBIG, "")), "computer"),
+        (problem_of(ModelError("no plant")), "machine"),
+        (problem_of(DesignError("too stiff")), "machine"),
+        (problem(422, "Machine not usable", ""), "machine"),
+        (problem(422, "Invalid parameter", ""), "machine"),
+        (problem(401, "Unauthorized", ""), "machine"),
+        (problem(409, "Job cancelled", ""), "computer"),
+        (input_gone("part.gcode"), "computer"),
+        (input_damaged("part.gcode"), "computer"),
+        (problem(429, "Quota exceeded", ""), "computer"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else value["title"],
+)
+def test_whose_fault_a_refusal_is(problem, trouble):
+    """Only what is the file's own fault is not tried again by `watch`."""
+    assert _failure_of(ClientError("why", problem["status"], problem)).trouble == trouble
 
 
 def test_a_server_that_is_not_there(tmp_path, capsys):

@@ -253,6 +253,15 @@ def test_an_answer_that_cannot_be_unpacked_is_told():
         client.machines()
 
 
+def test_a_server_that_cannot_now_says_why():
+    with (
+        pretending(lambda handler: handler.give(429, b'{"detail": "Wait 9 s."}')) as address,
+        Client(address, patience_s=0.3) as client,
+        pytest.raises(ClientError, match=f"{address} could not take the request: Wait 9 s."),
+    ):
+        client.machines()
+
+
 def test_it_asks_where_events_do_not_come_through():
     states = iter(["queued", "running", "done"])
 

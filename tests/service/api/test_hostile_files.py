@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import httpx2
 import psutil
@@ -115,6 +116,23 @@ def test_a_caller_who_hangs_up_ends_the_computation(tmp_path: Path) -> None:
         with pytest.raises(httpx2.ReadTimeout), httpx2.Client(base_url=client.base_url) as hasty:
             hasty.get(where, timeout=2.0)
         assert until(lambda: family(process) <= before, 20)
+
+
+def test_it_goes_on_for_somebody_else(tmp_path: Path) -> None:
+    """Who was told that the job goes on has not lost it."""
+    where = "/v1/machines/ender3/design?axis=x&robust=minimax"
+    with server(PRETEND, tmp_path) as (client, _):
+        with socket.create_connection(("127.0.0.1", client.base_url.port)) as first:
+            first.sendall(f"GET {where} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
+            (job,) = until(lambda: client.get("/v1/jobs?kind=design").json()["jobs"])
+            told = client.get(where, headers={"Prefer": "respond-async"})
+            assert (told.status_code, told.json()["id"]) == (202, job["id"])
+        until(lambda: state_of(client, job) not in ("queued", "running"), 120)
+        assert state_of(client, job) == "done"
+
+
+def state_of(client: httpx2.Client, job: dict[str, Any]) -> str:
+    return client.get(job["links"]["self"]).json()["state"]
 
 
 def family(process: subprocess.Popen[str]) -> set[int]:

@@ -13,7 +13,7 @@ from starlette.exceptions import HTTPException
 from starlette.types import Message
 
 from stillpath.service.api.body_timeout import LEAST_BYTES, BodyTimeout
-from stillpath.service.api.limits import Limits
+from stillpath.service.api.limits import CallerLimits
 from stillpath.service.api.problems import Problem
 from tests.service.security.test_limits import caller
 from tests.service.test_server import PRETEND, finished, server, until
@@ -86,7 +86,7 @@ def test_who_has_been_silent_for_long_yields_his_place(monkeypatch: pytest.Monke
     monkeypatch.setattr("stillpath.service.api.body_timeout._YIELDS_AFTER_S", 0.1)
 
     async def ask() -> None:
-        limits, ended = Limits(100, uploads=2), []
+        limits, ended = CallerLimits(100, uploads=2), []
 
         async def upload(*chunks: tuple[float, int], more: bool = True) -> None:
             body = BodyTimeout(Sender(*chunks, more=more).receive, quiet_s=5)

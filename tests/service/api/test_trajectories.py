@@ -75,6 +75,22 @@ def test_nothing_is_left_behind(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_what_the_disk_has_lost_or_damaged_is_computed_anew(
+    client: TestClient, where: str, data_dir: Path
+):
+    part = {"start_s": 0.5, "stop_s": 0.6}
+    whole = client.get(where, params=part).text
+    for harm in (Path.unlink, lambda path: path.write_bytes(b"x" * path.stat().st_size)):
+        stored = [
+            path
+            for path in data_dir.glob("jobs/*/*/result/hexagon.stillpath.csv")
+            if path.read_text() == whole
+        ]
+        harm(max(stored, key=lambda path: path.stat().st_mtime_ns))
+        assert_problem(client.get(where, params=part), 503, "ask again")
+        assert client.get(where, params=part).text == whole
+
+
 def test_an_upload_that_is_damaged_or_gone_is_told(client: TestClient, data_dir: Path):
     answer = client.post(f"{JOBS}&fresh=true&method=none", content=TEXT)
     job = until(client, answer.headers["location"], over)

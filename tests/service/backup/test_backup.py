@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import os
 import random
 import shutil
 import tarfile
@@ -11,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from sqlalchemy import Engine
 
 from stillpath.cli.main import run
 from stillpath.service.backup import archive
@@ -18,9 +20,11 @@ from stillpath.service.backup.archive import BackupError, back_up, restore
 from stillpath.service.database.engine import open_database
 from stillpath.service.deliveries.rows import deliveries_of
 from stillpath.service.instance_lock import exclusive
-from stillpath.service.jobs.state import JobState
+from stillpath.service.jobs.state import JobKind, JobState
 from stillpath.service.jobs.store import JobStore
+from stillpath.service.security.keys import KeyStore, announce_first_key
 from stillpath.service.settings import Settings
+from stillpath.service.storage.disk import Disk
 from tests.service.database.examples import finished, make_job
 
 
@@ -30,10 +34,15 @@ def data(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def store(data: Path) -> Iterator[JobStore]:
-    engine = open_database(Settings(data_dir=data))
-    yield JobStore(engine)
-    engine.dispose()
+def engine(data: Path) -> Iterator[Engine]:
+    opened = open_database(Settings(data_dir=data))
+    yield opened
+    opened.dispose()
+
+
+@pytest.fixture
+def store(engine: Engine) -> JobStore:
+    return JobStore(engine)
 
 
 def add_done(store: JobStore, data: Path, text: str = "G28\n") -> str:
@@ -69,15 +78,19 @@ def jobs(data: Path) -> dict[str, JobState]:
 
 
 @pytest.mark.parametrize("name", ["backup.tar", "backup.tar.gz"])
-def test_what_was_kept_comes_back(name, store, data, tmp_path):
+def test_what_was_kept_comes_back(name, engine, store, data, tmp_path):
     ids = [add_done(store, data, f"G28 ; {n}\n") for n in range(3)]
     write(data / "machines/mine/1.json", "{}")
     expected = tree(data)
     write(data / "incoming/half", "passing")
     write(data / "cache/shaper.json", "passing")
+    announce_first_key(KeyStore(engine), None, data)
+    Disk(data, 4 << 20).hold()
+    assert {"first-key", "disk-reserve"} <= {path.name for path in data.iterdir()}
     target = tmp_path / name
     with exclusive(data):  # a service is at work
         assert run(["backup", str(target), "--data-dir", str(data)]) == 0
+    assert os.name == "nt" or target.stat().st_mode & 0o777 == 0o600
     assert run(["restore", str(target), "--data-dir", str(tmp_path / "new")]) == 0
     assert tree(tmp_path / "new") == expected
     assert jobs(tmp_path / "new") == dict.fromkeys(ids, JobState.DONE)
@@ -93,6 +106,25 @@ def test_running_jobs_can_be_taken_up(store, data, tmp_path):
     restore(tmp_path / "b.tar", tmp_path / "new")
     assert jobs(tmp_path / "new") == {job.id: JobState.RUNNING}
     assert list(tree(tmp_path / "new")) == [f"jobs/{job.id}/source/part.gcode"]
+
+
+def test_jobs_without_an_upload_come_back(store, data, tmp_path):
+    """Designs and the like, done and queued, but none whose result is lost."""
+    done, queued, lost = (
+        make_job(kind=JobKind.DESIGN, source_name="", source_bytes=0, result_name="design.json")
+        for _ in range(3)
+    )
+    for job in (done, lost, queued):
+        write(data / f"jobs/{job.id}/machine.json", "{}")
+        store.add(job)
+    for job in (done, lost):
+        store.apply(job.id, finished(store.claim(job.id, 1500.0, "w")))
+    write(data / f"jobs/{done.id}/1/result/design.json", "{}")
+    back_up(data, tmp_path / "b.tar")
+    restore(tmp_path / "b.tar", tmp_path / "new")
+    assert jobs(tmp_path / "new") == {done.id: JobState.DONE, queued.id: JobState.QUEUED}
+    shutil.rmtree(data / f"jobs/{lost.id}")
+    assert tree(tmp_path / "new") == tree(data)
 
 
 def test_a_restore_starts_no_print(store, data, tmp_path):
@@ -161,9 +193,12 @@ def test_a_damaged_archive_changes_nothing(store, data, tmp_path):
         with pytest.raises(BackupError):
             restore(target, tmp_path / "new")
         assert [path.name for path in (tmp_path / "new").iterdir()] == ["service.lock"]
-    target.write_bytes(gzip.compress(whole)[:-600])
-    with pytest.raises(BackupError):
-        restore(target, tmp_path / "new")
+    compressed = gzip.compress(whole)
+    scrambled = bytes(byte ^ 0xFF for byte in compressed[500:520])
+    for broken in (compressed[:-600], compressed[:500] + scrambled + compressed[520:]):
+        target.write_bytes(broken)
+        with pytest.raises(BackupError):
+            restore(target, tmp_path / "new")
     target.write_bytes(b"no archive")
     assert run(["restore", str(target), "--data-dir", str(tmp_path / "new")]) == 2
 
@@ -234,6 +269,16 @@ def test_a_restore_that_was_killed_begins_anew(step, store, data, tmp_path, monk
     assert tree(new) == tree(data)
     assert len(jobs(new)) == 1
     assert not (new / ".restoring").exists()
+
+
+def test_backups_in_the_data_directory_are_not_in_the_next_one(store, data, tmp_path):
+    """In a container nothing else can be written to."""
+    add_done(store, data)
+    expected = tree(data)
+    for name in ("1.tar", "2.tar"):
+        assert run(["backup", str(data / "backups" / name), "--data-dir", str(data)]) == 0
+    restore(data / "backups/2.tar", tmp_path / "new")
+    assert tree(tmp_path / "new") == expected
 
 
 def test_refusals(store, data, tmp_path, monkeypatch, capsys):

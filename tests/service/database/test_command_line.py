@@ -82,11 +82,11 @@ def test_commands_without_a_database_do_not_load_it(arguments: list[str]):
 def test_a_lost_database_is_not_made_anew_beside_files_of_jobs(
     data_dir: Path, capsys: pytest.CaptureFixture[str]
 ):
-    assert run(["keys", "list"]) == 0
+    assert run(["migrate"]) == 0
     (data_dir / "jobs" / "7aba" / "source").mkdir(parents=True)
-    assert run(["keys", "list"]) == 0
+    assert run(["migrate"]) == 0
     (data_dir / "jobs" / "7aba" / "source" / "part.gcode").write_text("G1 X1\n")
-    assert run(["keys", "list"]) == 0
+    assert run(["migrate"]) == 0
     database, log = data_dir / "stillpath.sqlite3", data_dir / "stillpath.sqlite3-wal"
     log.write_bytes(b"what was written last")
     for lose in (database.unlink, database.touch):
@@ -96,7 +96,7 @@ def test_a_lost_database_is_not_made_anew_beside_files_of_jobs(
         assert log.read_bytes() == b"what was written last"
         assert not database.exists() or not database.stat().st_size
     (data_dir / "jobs").rename(data_dir / "kept")
-    assert run(["keys", "list"]) == 0
+    assert run(["migrate"]) == 0
 
 
 def test_a_wrong_database_does_not_cost_a_bucket_its_files(

@@ -340,10 +340,12 @@ def test_a_printer_that_does_not_answer_is_sent_its_file_and_nothing_more(tmp_pa
 # Over HTTP, and on the command line
 
 
-def printers_file(tmp_path: Path, server: Listener, machine: str = "ender3") -> Path:
+def printers_file(tmp_path: Path, server: Listener) -> Path:
     file = tmp_path / "printers.toml"
     file.write_text(
-        f"[printer.left]\nkind = 'moonraker'\nurl = '{server.url}'\nmachine = '{machine}'\n"
+        f"[printer.left]\nkind = 'moonraker'\nurl = '{server.url}'\nmachine = 'ender3'\n"
+        f"[printer.advised]\nkind = 'moonraker'\nurl = '{server.url}'\nmachine = 'ender3'\n"
+        "method = 'advise'\n"
         "[printer.octo]\nkind = 'octoprint'\nurl = 'http://127.0.0.1:9'\nmachine = 'ender3'\n"
     )
     return file
@@ -375,6 +377,13 @@ def test_over_http_and_in_the_report(tmp_path: Path):
             until(lambda: _delivery(client, job)["state"] == "done")
             assert "rotation_distance has changed" in _delivery(client, job)["error"]
             assert client.post("/v1/printers/left/accept").json()["findings"] == []
+            [entry] = client.get("/v1/audit?action=printer.accept").json()["entries"]
+            assert entry["subject"] == "left"
+            changed(status, **OWN_LIMIT_MACRO)
+            for name, unsafe in (("left", [True]), ("advised", [])):
+                found = client.get(f"/v1/printers/{name}/check").json()["findings"]
+                assert [f["unsafe"] for f in found if f["place"] == "SET_VELOCITY_LIMIT"] == unsafe
+            del status["configfile"]["config"]["gcode_macro Set_Velocity_Limit"]
             assert client.get("/v1/printers/left/check").json()["findings"] == []
             for name, code in (("nobody", 404), ("octo", 422)):
                 assert client.get(f"/v1/printers/{name}/check").status_code == code
@@ -399,10 +408,15 @@ def test_on_the_command_line(tmp_path: Path, monkeypatch, capsys):
         changed(status, **KINEMATICS)
         assert run(command) == 2
         assert capsys.readouterr().out.startswith("unsafe: [printer] kinematics")
+        changed(status, configfile__settings__printer__kinematics="cartesian", **OWN_LIMIT_MACRO)
+        assert run(command) == 2
+        assert "unsafe: [gcode_macro" in capsys.readouterr().out
+        run(["printers", "check", "advised", "--printers", str(file)])
+        assert "unsafe" not in capsys.readouterr().out
         accept = ["printers", "accept", "left", "--printers", str(file)]
         assert run(accept) == 0
         assert run(["printers", "check", "nobody", "--printers", str(file)]) == 2
-        assert "known: left, octo" in capsys.readouterr().err
+        assert "known: advised, left, octo" in capsys.readouterr().err
     assert run(command) == 2
     assert "cannot be reached" in capsys.readouterr().err
     assert run(["printers", "check", "left"]) == 2

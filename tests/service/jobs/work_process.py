@@ -8,7 +8,7 @@ if __name__ == "__main__":
     from stillpath.service.database.engine import open_database
     from stillpath.service.environment import prepare_environment
     from stillpath.service.jobs.store import JobStore
-    from stillpath.service.jobs.work import Work
+    from stillpath.service.jobs.work import JobRunner
     from stillpath.service.logs import configure_logging
     from stillpath.service.settings import Settings
     from stillpath.service.storage.factory import open_storage
@@ -19,7 +19,9 @@ if __name__ == "__main__":
     configure_logging()
     settings = Settings()
     engine = open_database(settings)
-    work = Work(settings, JobStore(engine), open_storage(settings), getattr(runners, sys.argv[1]))
+    work = JobRunner(
+        settings, JobStore(engine), open_storage(settings), getattr(runners, sys.argv[1])
+    )
     ended = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ended.set())

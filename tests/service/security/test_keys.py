@@ -189,6 +189,10 @@ def test_commands(
         captured = capsys.readouterr()
         return code, captured.out.strip(), captured.err
 
+    for words in (["keys", "list"], ["audit"]):
+        assert run([*words, "--data-dir", str(tmp_path / "typo")]) == 2
+        assert "there is no database in" in capsys.readouterr().err
+    assert not (tmp_path / "typo").exists()
     code, first, _ = call("keys", "first")
     assert code == 0
     assert store.find(first).scopes == frozenset(Scope)

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stillpath.service.api.limits import Limits, name_of
+from stillpath.service.api.limits import CallerLimits, name_of
 from stillpath.service.api.problems import Problem
 from stillpath.service.security.callers import Caller, Scope
 
@@ -22,7 +22,7 @@ class Clock:
         return self.now
 
 
-def is_granted(limits: Limits, who: str) -> bool:
+def is_granted(limits: CallerLimits, who: str) -> bool:
     try:
         limits.take(who)
     except Problem as problem:
@@ -35,7 +35,7 @@ def is_granted(limits: Limits, who: str) -> bool:
 )
 def test_never_more_than_a_bucket_and_its_filling(per_minute: int, pauses_s: list[float]):
     clock = Clock()
-    limits = Limits(per_minute, clock=clock)
+    limits = CallerLimits(per_minute, clock=clock)
     granted = 0
     for pause_s in pauses_s:
         clock.now += pause_s
@@ -45,7 +45,7 @@ def test_never_more_than_a_bucket_and_its_filling(per_minute: int, pauses_s: lis
 
 def test_a_patient_caller_is_always_served():
     clock = Clock()
-    limits = Limits(60, clock=clock)
+    limits = CallerLimits(60, clock=clock)
     while is_granted(limits, "a"):
         pass
     for _ in range(100):
@@ -55,7 +55,7 @@ def test_a_patient_caller_is_always_served():
 
 def test_waiting_as_long_as_told_is_enough():
     clock = Clock()
-    limits = Limits(7, clock=clock)
+    limits = CallerLimits(7, clock=clock)
     while True:
         try:
             limits.take("a")
@@ -66,7 +66,7 @@ def test_waiting_as_long_as_told_is_enough():
 
 
 def test_callers_do_not_disturb_each_other():
-    limits = Limits(3, clock=Clock())
+    limits = CallerLimits(3, clock=Clock())
     for who in ("a", "b"):
         assert [is_granted(limits, who) for _ in range(4)] == [True, True, True, False]
 
@@ -83,14 +83,14 @@ def test_who_is_counted_together():
 
 
 def test_memory_does_not_grow_with_the_number_of_addresses():
-    limits = Limits(3, clock=Clock())
+    limits = CallerLimits(3, clock=Clock())
     for n in range(30_000):
         limits.take(f"address {n}")
     assert len(limits._buckets) <= 10_000
 
 
 def test_places_for_uploads_are_given_back():
-    limits = Limits(100, uploads=2)
+    limits = CallerLimits(100, uploads=2)
     for _ in range(3):
         with limits.uploading(caller("k")), limits.uploading(caller("k")):
             with pytest.raises(Problem) as caught, limits.uploading(caller("k")):

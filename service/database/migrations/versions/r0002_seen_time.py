@@ -1,4 +1,4 @@
-"""The time that the service was seen to run, and since when, by it, what is over has been kept."""
+"""Add `seen_time` and the columns `kept_from_s`, so that expiry does not depend on the clock."""
 
 import sqlalchemy as sa
 from alembic import op

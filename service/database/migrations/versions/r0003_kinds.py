@@ -1,4 +1,4 @@
-"""What a job computes, as everything that computes is one; and the room that it needs."""
+"""Add the columns `kind` and `room_bytes` to the table `jobs`."""
 
 import sqlalchemy as sa
 from alembic import op
