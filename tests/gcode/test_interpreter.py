@@ -185,7 +185,8 @@ def test_classes(wary_machine: Machine) -> None:
         "": EventKind.HARMLESS,
         "M106 S255": EventKind.HARMLESS,
         "M104 S200": EventKind.HARMLESS,
-        "SET_PRESSURE_ADVANCE ADVANCE=0.05": EventKind.HARMLESS,
+        "SET_PRESSURE_ADVANCE ADVANCE=0.05": EventKind.STOP,
+        "SET_PRESSURE_ADVANCE ADVANCE=0.06": EventKind.HARMLESS,
         "M117 G1 X500 Y500 ; not a move": EventKind.HARMLESS,
         "M117 100% done (really)": EventKind.HARMLESS,
         'RESPOND MSG="G1 X1; quoted"': EventKind.HARMLESS,
@@ -215,8 +216,8 @@ def test_classes(wary_machine: Machine) -> None:
     }
     block = run("\n".join(expected) + "\n", wary_machine)
     assert dict(zip(expected, kinds(block), strict=True)) == expected
-    # The dwell, and for the shaper twice the time that pressure advance looks ahead.
-    assert block.events.dwell_s.sum() == pytest.approx(0.2 + 0.04)
+    # The dwell, and how far pressure advance looks ahead: after none, and twice for the shaper.
+    assert block.events.dwell_s.sum() == pytest.approx(0.2 + 0.021 + 0.04)
 
 
 def test_a_shaper_with_much_damping_makes_klipper_stand_longer(golden_machine: Machine) -> None:
@@ -231,6 +232,32 @@ def test_a_shaper_with_much_damping_makes_klipper_stand_longer(golden_machine: M
         ahead_s = 0.5 / 40.0 / bent / (1.0 + np.exp(-np.pi * damping / bent))
         assert stands[damping] == pytest.approx(1e-3 + ahead_s, abs=1e-9)
     assert stands[0.3] - stands[0.05] > 1.5e-3
+
+
+@pytest.mark.parametrize(
+    ("line", "dwell_s"),
+    [
+        ("ADVANCE=0", 0.021),
+        ("ADVANCE=.07", None),
+        ("ADVANCE=.05 SMOOTH_TIME=.04 EXTRUDER=extruder", None),
+        ("SMOOTH_TIME=.1", 0.07),
+        ("SMOOTH_TIME=0", 0.021),
+        ("ADVANCE=.05 EXTRUDER=extruder1", None),
+        ("SMOOTH_TIME=.1 EXTRUDER=extruder1", 0.07),
+        # Nothing changes for the extruder in use, which looks ahead as before.
+        ("ADVANCE=0 EXTRUDER=extruder1", 0.04),
+        ("ADVANCE=0 EXTRUDER=my_stepper", 0.04),
+    ],
+)
+def test_klipper_stands_where_pressure_advance_averages_over_another_time(
+    line: str, dwell_s: float | None, golden_machine: Machine
+) -> None:
+    machine = golden_machine.model_copy(update={"pressure_advance_s": 0.05})
+    block = run(f"SET_PRESSURE_ADVANCE {line}\n" * 2, machine)
+    again = line.endswith("my_stepper")
+    stop, harmless = EventKind.STOP, EventKind.HARMLESS
+    assert kinds(block) == [harmless if dwell_s is None else stop, stop if again else harmless]
+    assert block.events.dwell_s[0] == pytest.approx(dwell_s or 0.0)
 
 
 def test_macros_that_the_machine_declares(wary_machine: Machine) -> None:
