@@ -24,6 +24,7 @@ from stillpath.gcode.firmware.line_reader import (
     FEED,
     POSITIONING,
     SET_POSITION,
+    STANDS,
     LineReader,
 )
 from stillpath.gcode.firmware.planning import stops
@@ -157,12 +158,8 @@ class StreamWriter:
                 continue  # a line that also moves cannot be repeated
             self._shaper_off = False
             self._file_shapers.note(line, int(events.line[row]))
-        if len(moves):
-            last_stop = events.move_index[stops(events)]
-            stands = len(last_stop) > 0 and int(last_stop[-1]) == len(moves)
-            self._at_rest = stands or self._rests(verbatim, len(moves) - 1)
-        elif np.any(stops(events)):
-            self._at_rest = True
+        if len(moves) or np.any(stops(events)):
+            self._at_rest = self._rests(verbatim, at_end=True)
         return lead + verbatim.text
 
     def piece(self, piece: Piece, encoded: Encoded, extruder_mm: float) -> bytes:
@@ -393,9 +390,7 @@ class StreamWriter:
         shaper = self._shaper_before(verbatim)
         if not self._streaming:
             return self._unmarked() + shaper
-        stop = (
-            b"" if self._at_rest or self._rests(verbatim, 0) else self._stream_commands.stand_still
-        )
+        stop = b"" if self._at_rest or self._rests(verbatim) else self._stream_commands.stand_still
         limits = verbatim.limits_before
         if self._shaper_off and self._shaper_is_known:
             self._marked, limits = limits, self._stream_commands.in_stream(limits)
@@ -410,15 +405,17 @@ class StreamWriter:
         limits, self._marked = self._marked, None
         return self._stream_commands.limits(limits)
 
-    def _rests(self, verbatim: VerbatimPart, row: int) -> bool:
-        """Return whether the machine stands still anyway before and after a move."""
+    def _rests(self, verbatim: VerbatimPart, *, at_end: bool = False) -> bool:
+        """Return whether the machine certainly stands before a part, or after it."""
         moves, events = verbatim.moves, verbatim.events
-        rests = stops(events)
+        edge, nearest = (len(moves), -1) if at_end else (0, 0)
+        stop_rows = np.flatnonzero(stops(events) & (events.move_index == edge))
+        if len(stop_rows):
+            line = verbatim.line(events, int(stop_rows[nearest]))
+            return STANDS.match(line) is not None
         if len(moves) == 0:
-            return bool(np.any(rests))
-        if row == 0 and np.any((events.move_index == 0) & rests):
-            return True
-        travel = moves.end_mm[row] - moves.start_mm[row]
+            return False
+        travel = moves.end_mm[nearest] - moves.start_mm[nearest]
         return self._extruder_alone_stops and not np.any(travel[:3])
 
     def _end(self, extruder_mm: float) -> bytes:

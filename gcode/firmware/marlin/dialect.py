@@ -103,7 +103,7 @@ STEPS: dict[str, Word] = {
         "M906 M907 M908 M909 M910 M911 M912 M913 M914 M919 M951 M1003 M3426 M7219",
         EventKind.HARMLESS,
     ),
-    # Come to rest, wait, go on from the same place.
+    # Come to rest, wait, go on from the same place. M114 does in some builds only.
     **words(
         "M3 M4 M5 M7 M8 M9 M10 M11 M12 M80 M109 M114 M190 M191 M192 M193 M240 M290 M293 M294 M303 "
         "M400 M872",
