@@ -198,6 +198,8 @@ def test_classes(wary_machine: Machine) -> None:
         "G1 F1800": EventKind.MODE,
         "G21": EventKind.HARMLESS,
         "M400": EventKind.STOP,
+        "M119": EventKind.STOP,
+        "QUERY_ENDSTOPS": EventKind.STOP,
         "M109 S200": EventKind.STOP,
         "TEMPERATURE_WAIT SENSOR=extruder MINIMUM=5": EventKind.STOP,
         "G4 P200": EventKind.STOP,

@@ -113,6 +113,14 @@ def test_the_host_stands_for_the_smooth_time_of_pressure_advance(tmp_path: Path)
     assert max(found.largest.values()) < 1e-6
 
 
+@pytest.mark.parametrize("line", ["M119", "QUERY_ENDSTOPS"])
+def test_the_host_brakes_to_ask_the_endstops(line: str, tmp_path: Path) -> None:
+    machine = of_the_package(homed(load_machine("ender3")))
+    text = f"G28\nG90\nM83\nG1 X10 Y10 Z5 F3000\nG1 X50 E1\n{line}\nG1 X90 E1\n"
+    run(text, machine, tmp_path)
+    assert max(compared(text, machine, recorded(tmp_path)).largest.values()) < 1e-6
+
+
 def test_a_file_that_the_host_did_not_get_differs(
     written: tuple[Path, Machine], tmp_path: Path
 ) -> None:
