@@ -49,6 +49,12 @@ def velocity_limit(state: MachineState, command: Command) -> int:
             values[field] = state.number(given[key], key, command)
             if not allows(values[field]):
                 raise state.problem(f"{key}={given[key]} must be {allowed}", command)
+    if "ACCEL_TO_DECEL" in given and "MINIMUM_CRUISE_RATIO" not in given:
+        state.warn(
+            "ACCEL_TO_DECEL is not followed (Klipper ignores it since 2025-08-11): on an older one "
+            "short moves have other speeds; let the slicer write MINIMUM_CRUISE_RATIO, or update "
+            "Klipper"
+        )
     return state.set_limits(command, values)
 
 
