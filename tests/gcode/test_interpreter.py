@@ -264,12 +264,16 @@ def test_klipper_stands_where_pressure_advance_averages_over_another_time(
 
 def test_macros_that_the_machine_declares(wary_machine: Machine) -> None:
     firmware = wary_machine.firmware.model_copy(
-        update={"harmless_macros": ("_on_layer",), "stopping_macros": ("CLEAN", "M600")}
+        update={
+            "harmless_macros": ("_on_layer",),
+            "stopping_macros": ("CLEAN", "M600"),
+            "macros": ("M900", "M106"),  # not Klipper's own commands
+        }
     )
     machine = wary_machine.model_copy(update={"firmware": firmware})
-    block = run("_ON_LAYER LAYER=1\nCLEAN\nm600\nOTHER\n", machine)
-    stop = EventKind.STOP
-    assert kinds(block) == [EventKind.HARMLESS, stop, stop, EventKind.UNKNOWN]
+    block = run("_ON_LAYER LAYER=1\nCLEAN\nm600\nOTHER\nM900 K5\nM205 X8\nM106\n", machine)
+    harmless, stop, unknown = EventKind.HARMLESS, EventKind.STOP, EventKind.UNKNOWN
+    assert kinds(block) == [harmless, stop, stop, unknown, unknown, harmless, harmless]
 
 
 def test_a_printer_without_macros_still_has_klippers_own_commands(golden_machine: Machine) -> None:

@@ -6,7 +6,8 @@ look-ahead queue, which only attach to it (fans, heaters, pressure advance), whi
 Commands are of three sorts. NATIVE ones do the same on every machine. MACRO ones exist only where
 the user configured a macro of that name, and then may do anything; a machine that says
 ``unknown_commands: skip`` lacks them, and Klipper passes over what it lacks without a stop. Words
-that slicers write for other firmwares (FOREIGN) are passed over too.
+that slicers write for other firmwares (FOREIGN) are passed over too, unless they are among the
+machine's ``macros``.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from stillpath.gcode.firmware.klipper import commands, flushing
 from stillpath.gcode.types import EventKind
 from stillpath.models.firmware import Klipper
 
-__all__ = ["klipper"]
+__all__ = ["FOREIGN", "klipper"]
 
 KERNEL_WORDS: dict[str, Word] = {
     "G0": Action.MOVE,
@@ -135,6 +136,7 @@ def klipper(firmware: Klipper) -> Dialect:
         **({} if firmware.arcs else NO_ARCS),
         **({} if firmware.retraction else NO_RETRACTION),
         **FOREIGN,
+        **{name.upper(): EventKind.UNKNOWN for name in firmware.macros},
         **NATIVE,
         **{name.upper(): EventKind.STOP for name in firmware.stopping_macros},
         **{name.upper(): EventKind.HARMLESS for name in firmware.harmless_macros},
