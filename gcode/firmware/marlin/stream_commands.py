@@ -55,7 +55,7 @@ class MarlinStreamCommands:
         self._advances = firmware.linear_advance is not False
         self._classic_jerk = firmware.junction == "classic_jerk"
         self._least_steps = firmware.min_steps_per_segment
-        self._least_mm = firmware.min_steps_per_segment / firmware.steps_per_mm.x
+        self._least_mm = firmware.shortest_move_mm
 
     @property
     def notes(self) -> tuple[str, ...]:
