@@ -143,6 +143,10 @@ def test_quarter_arc_and_circle(golden_machine: Machine) -> None:
         ("M220 S0", "above 0"),
         ("G4 P-5", "value -5 is .*P of G4"),
         ("RESTORE_GCODE_STATE NAME=none", "SAVE_GCODE_STATE"),
+        (
+            "\n".join(f"SAVE_GCODE_STATE NAME={max(0, k)}" for k in range(-9, 1001)),
+            "more than 1000 names; use a name again",
+        ),
         ("SET_VELOCITY_LIMIT ACCEL=0", "above 0"),
         ("SET_VELOCITY_LIMIT ACCEL=nan", "out of range"),
         ('SET_VELOCITY_LIMIT ACCEL="5', "quote"),
