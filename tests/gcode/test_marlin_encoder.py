@@ -17,7 +17,7 @@ from stillpath.gcode.firmware.marlin._encoder_kernels import (
     bend_reversals,
     thin,
 )
-from stillpath.gcode.firmware.marlin.adapter import MarlinAdapter
+from stillpath.gcode.firmware.marlin.adapter import STEEPEST_MESH, MarlinAdapter
 from stillpath.gcode.firmware.marlin.encoder import stream_limits
 from stillpath.gcode.firmware.marlin.limits import MarlinLimits, initial_limits
 from stillpath.gcode.firmware.marlin.stream_commands import MarlinStreamCommands
@@ -183,6 +183,11 @@ def test_what_cannot_be_executed_is_refused(facts: dict[str, Any], says: str) ->
     assert refusal is not None
     assert says in refusal
     assert "method advise" in refusal
+
+
+def test_the_document_says_how_steep_a_bed_mesh_may_be() -> None:
+    document = (Path(__file__).parents[2] / "docs" / "marlin.md").read_text()
+    assert f"a bed mesh steeper than {STEEPEST_MESH:g} " in document
 
 
 def test_the_coarser_axis_says_what_is_swallowed() -> None:

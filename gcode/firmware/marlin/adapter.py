@@ -25,7 +25,7 @@ from stillpath.gcode.types import Limits
 from stillpath.models.firmware import Marlin
 from stillpath.models.machine import CommandLimits, Machine
 
-__all__ = ["LONGEST_LEAST_MM", "MarlinAdapter"]
+__all__ = ["LONGEST_LEAST_MM", "STEEPEST_MESH", "MarlinAdapter"]
 
 STEEPEST_MESH = 0.1
 """Z is driven with the stream's acceleration times the slope."""
