@@ -38,7 +38,7 @@ FILE_SETS_SHAPER = "The file sets the firmware's input shaper"
 
 _BYTES_PER_LINE = 96
 _LEVEL, _EVENT, _REST = range(3)
-_SHAPED = (EventKind.UNKNOWN, EventKind.SHAPER)
+_MAY_SET_SHAPER = (EventKind.UNKNOWN, EventKind.SHAPER)
 _LEAST_GAP_MM = 1e-7
 _FAR_MM = 10.0
 """32-bit floats resolve a micrometre up to here."""
@@ -149,7 +149,7 @@ class StreamWriter:
         lead = self._off(verbatim, extruder_mm)
         if self._marked is not None:
             self._marked = verbatim.limits_after
-        for row in np.flatnonzero(np.isin(events.kind, _SHAPED)).tolist():
+        for row in np.flatnonzero(np.isin(events.kind, _MAY_SET_SHAPER)).tolist():
             line = verbatim.line(events, row)
             conflict = self._stream_commands.conflict(line)
             if conflict is not None:
@@ -184,7 +184,10 @@ class StreamWriter:
         for at, kind, what in sorted(order):
             upto = int(line_end[at - 1]) if at else 0
             if upto > done:
-                parts += [self._ours(limits[level[at - 1]], modes.at(at - 1)), text[done:upto]]
+                parts += [
+                    self._enter_stream_state(limits[level[at - 1]], modes.at(at - 1)),
+                    text[done:upto],
+                ]
                 done = upto
             written = float(extruded[at - 1] if at else piece.moves.start_mm[0, 3])
             if kind == _EVENT:
@@ -193,7 +196,10 @@ class StreamWriter:
                 last_line = int(piece.moves.line[what])
                 parts.append(self._rest_line(piece, what, written))
         if len(text) > done:
-            parts += [self._ours(limits[level[-1]], modes.at(len(rows) - 1)), text[done:]]
+            parts += [
+                self._enter_stream_state(limits[level[-1]], modes.at(len(rows) - 1)),
+                text[done:],
+            ]
         last = piece.moves.speed_mm_s[-1]
         self._file_feed_mm_min = float(last) * 60.0 / piece.modal_after.speed_factor
         self._at_rest = False
@@ -317,10 +323,10 @@ class StreamWriter:
         lines = self._stream_commands.limits(limits).splitlines(keepends=True)
         return b"".join(line for line in lines if line not in known.splitlines(keepends=True))
 
-    def _ours(self, limits: Limits, ours: ModalState) -> bytes:
+    def _enter_stream_state(self, limits: Limits, modes: ModalState) -> bytes:
         """Return lines that set the stream's limits and modes."""
-        text = self._limits_to(limits) + self._file_modes(ours)
-        self._modal = ours
+        text = self._limits_to(limits) + self._file_modes(modes)
+        self._modal = modes
         if self._far_mm is not None:
             self._zero_mm += self._far_mm
             self._far_mm = None
@@ -446,7 +452,7 @@ class StreamWriter:
         """
         prints = bool(np.any(verbatim.moves.prints))
         # A line that sets part of the shaper must find the other parts unchanged.
-        foreign = bool(np.any(np.isin(verbatim.events.kind, _SHAPED)))
+        foreign = bool(np.any(np.isin(verbatim.events.kind, _MAY_SET_SHAPER)))
         aside = isinstance(verbatim, LeftOut)  # between streams again and again
         if (prints and not aside) or foreign:
             return self._shaper_on(verbatim.limits_before)

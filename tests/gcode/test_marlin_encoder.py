@@ -158,6 +158,7 @@ def test_the_shaper_of_the_firmware() -> None:
         )
     # Nobody says whether there is one: off it goes, and the pipeline warns.
     unknown = MarlinStreamCommands(Marlin())
+    assert unknown.acceleration(1e6) == b"M204 P1000000 T1000000\n"
     assert (unknown.shaper_off, unknown.shaper_on) == (b"M593 F0\n", None)
 
 

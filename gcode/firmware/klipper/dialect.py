@@ -3,11 +3,10 @@
 Facts: Klipper's command handlers as of 2026-08 (klippy/extras/*.py): which of them flush the
 look-ahead queue, which only attach to it (fans, heaters, pressure advance), which move.
 
-Commands are of three sorts. NATIVE ones do the same on every machine. MACRO ones exist only where
-the user configured a macro of that name, and then may do anything; a machine that says
-``unknown_commands: skip`` lacks them, and Klipper passes over what it lacks without a stop. Words
-that slicers write for other firmwares (FOREIGN) are passed over too, unless they are among the
-machine's ``macros``.
+NATIVE commands do the same on every machine. Words that slicers write for other firmwares (FOREIGN)
+are passed over, unless they are among the machine's ``macros``. Names in neither table are macros,
+or unknown: they may do anything, unless the machine says ``unknown_commands: skip``; Klipper passes
+over what it lacks without a stop.
 """
 
 from __future__ import annotations

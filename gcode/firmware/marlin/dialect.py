@@ -74,7 +74,7 @@ RETRACTION: dict[str, Word] = {
     "G11": retract,
     "M207": commands.retract_settings,
     "M208": commands.retract_settings,
-    "M209": commands.unheeded(
+    "M209": commands.not_modelled(
         EventKind.HARMLESS, "moves of the extruder alone may turn into retractions of the firmware"
     ),
 }
@@ -87,7 +87,7 @@ LIMITS: dict[str, Word] = {
     "M900": commands.linear_advance,
 }
 
-_MOVED = commands.unheeded(
+_MOVED = commands.not_modelled(
     EventKind.UNKNOWN, "from here on the position is not known until the printer homes"
 )
 
@@ -129,15 +129,15 @@ STEPS: dict[str, Word] = {
         _MOVED,
     ),
     **words("M501 M502", commands.reset_limits),
-    "M808": commands.unheeded(
+    "M808": commands.not_modelled(
         EventKind.UNKNOWN, "a part of the file repeats; it is read as if it were there once"
     ),
-    "M92": commands.unheeded(EventKind.HARMLESS, "steps per mm are taken from the machine"),
+    "M92": commands.not_modelled(EventKind.HARMLESS, "steps per mm are taken from the machine"),
     "M593": EventKind.SHAPER,
     # Fixed-time motion has a planner and shapers of its own.
     **words(
         "M493 M494",
-        commands.unheeded(EventKind.UNKNOWN, "fixed-time motion is not modelled"),
+        commands.not_modelled(EventKind.UNKNOWN, "fixed-time motion is not modelled"),
     ),
     "M495": commands.resonance_test,
     "M496": EventKind.HARMLESS,
@@ -148,7 +148,7 @@ def _optional(firmware: Marlin) -> dict[str, Word]:
     """Return the words of the build's options, those that it lacks as barriers."""
     table: dict[str, Word] = {}
     for option, found in OPTIONS.items():
-        lacking = commands.unheeded(
+        lacking = commands.not_modelled(
             EventKind.UNKNOWN,
             f"the build lacks it, as the machine says; if it does not, set {option} in the "
             "machine's firmware section",

@@ -134,7 +134,8 @@ class MarlinStreamCommands:
 
     def acceleration(self, accel_mm_s2: float) -> bytes:
         """Return the line that sets the acceleration of moves with and without filament."""
-        return f"M204 P{accel_mm_s2:g} T{accel_mm_s2:g}\n".encode()
+        accel = _number(float(f"{accel_mm_s2:g}"))
+        return f"M204 P{accel} T{accel}\n".encode()
 
     def in_stream(self, limits: Limits) -> Limits:
         """Return the limits with linear advance off: a rest's own moves know none.
