@@ -15,11 +15,21 @@ _SLOWEST_MM_S = 1e-3
 
 
 class Bounds(NamedTuple):
-    """Tolerances of a segment [mm], and its largest speed steps [mm/s].
+    """Tolerances and largest speed steps of a segment.
 
-    Tolerances along and across the path, the widening of the funnel in which the end is chosen, and
-    tolerances of z and e; then the largest speed step of an axis, and of the extruder at one speed
-    along the path, which is what a change of filament per mm means.
+    Attributes
+    ----------
+    along_mm, across_mm : float
+        Tolerances along and across the path.
+    loose_mm : float
+        By how much the funnel in which the end is chosen is wider.
+    z_mm, e_mm : float
+        Tolerances of z and e.
+    step_mm_s : float
+        Largest speed step of an axis.
+    feed_step_mm_s : float
+        Largest speed step of the extruder at one speed along the path, which is what a change of
+        filament per mm means.
     """
 
     along_mm: float

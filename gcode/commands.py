@@ -23,7 +23,7 @@ def home(state: MachineState, command: Command) -> int:
 
 
 def no_arc(state: MachineState, command: Command) -> int:
-    """G2 and G3 where the machine states no arcs: skipped, a macro, or drawn after all."""
+    """G2 and G3 where the machine states no arcs: skipped, unless a macro has that name."""
     state.warn(
         f"{command.name}: this machine draws no arcs (firmware.arcs), so the printer skips the "
         "move; slice without arcs, or correct the machine"

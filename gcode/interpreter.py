@@ -36,6 +36,8 @@ _BOM = b"\xef\xbb\xbf"
 _BOM_16 = (b"\xff\xfe", b"\xfe\xff")
 _MOVE = re.compile(rb"\s*G0*[0-3](?![\d.])", re.IGNORECASE)
 _PAD = b"\n" * PADDING
+_MOTION_OF = {Action.MOVE: 1, Action.ARC_CW: 2, Action.ARC_CCW: 3}
+"""The G that a line without one repeats."""
 _BLOCK_BYTES, _CHUNK = 1 << 17, 1 << 20
 _LONGEST_LINE = 1 << 24
 _LONGEST_COMMAND = 65_536
@@ -77,8 +79,8 @@ class Interpreter:
         self.state = MachineState(machine, dialect, limits, strict=strict_bounds)
         self._modal: list[ModalState] = []
         self._limits: list[Limits] = []
-        self._carry: list[bytes] = []
-        self._carried = 0
+        self._pending: list[bytes] = []
+        self._pending_bytes = 0
         self._offset = 0
         self._first_move = 0
         self._text = b""
@@ -129,8 +131,8 @@ class Interpreter:
 
     def flush(self) -> list[ProgramBlock]:
         """Interpret the rest as the last line; it may lack its newline."""
-        text = b"".join((*self._carry, _PAD))
-        self._carry, self._carried = [], 0
+        text = b"".join((*self._pending, _PAD))
+        self._pending, self._pending_bytes = [], 0
         if _MOVE.match(text):
             self.state.warn(
                 "the file ends with a move and without a line end: it may have been cut off; "
@@ -148,27 +150,27 @@ class Interpreter:
         """Return an independent interpreter that continues from here."""
         other = copy.copy(self)
         other.state = self.state.snapshot()
-        for name in ("_modal", "_limits", "_carry"):
+        for name in ("_modal", "_limits", "_pending"):
             setattr(other, name, getattr(self, name).copy())
         return other
 
     # Reading
 
     def _push(self, data: bytes) -> list[ProgramBlock]:
-        first = data.find(b"\n") if self._carried else -1
-        if self._carried + (len(data) if first < 0 else first) > _LONGEST_LINE + _CHUNK:
+        first = data.find(b"\n") if self._pending_bytes else -1
+        if self._pending_bytes + (len(data) if first < 0 else first) > _LONGEST_LINE + _CHUNK:
             raise GcodeError(
                 f"the line has more than {_LONGEST_LINE} bytes; is this G-code?",
                 line=int(self.state.i[at.I_LINE]),
             )
         cut = data.rfind(b"\n") + 1
         if cut == 0:
-            self._carry.append(data)
-            self._carried += len(data)
+            self._pending.append(data)
+            self._pending_bytes += len(data)
             return []
-        text = b"".join((*self._carry, memoryview(data)[:cut], _PAD))
-        self._carry = [data[cut:]] if cut < len(data) else []
-        self._carried = len(data) - cut
+        text = b"".join((*self._pending, memoryview(data)[:cut], _PAD))
+        self._pending = [data[cut:]] if cut < len(data) else []
+        self._pending_bytes = len(data) - cut
         return self._read(text)
 
     def _read(self, text: bytes) -> list[ProgramBlock]:
@@ -353,7 +355,7 @@ class Interpreter:
                 handled = odd(state, command)
                 if handled >= 0:
                     return handled
-            state.i[at.I_MOTION] = action - 19 if action > Action.MOVE else 1
+            state.i[at.I_MOTION] = _MOTION_OF[action]
             for given, read in odd_numbers(command):
                 how = f"reads it as {read}" if read else "passes it over"
                 state.warn(f"{given} is not a number, and {self.dialect.title} {how}; correct it")

@@ -33,8 +33,8 @@ LOOSE_SHARE = 0.15
 FULL_GAIN = 5.0
 """Gain of a resonance up to which all of the tolerance is used."""
 BEYOND_MODEL = 0.5
-"""Added to a machine's response to an error. A model ends with its band, a machine does not: all of
-the error would otherwise be moved to frequencies at which the machine is unknown."""
+"""Added to the response of the model. Above the model's band the machine's response is unknown;
+without this term the fit would move all error there."""
 Z_TOLERANCE_MM = 1e-3
 E_TOLERANCE_MM = 3e-4
 """Uneven filament means steps of the extruder's speed, for which firmwares brake."""

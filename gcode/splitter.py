@@ -34,9 +34,9 @@ __all__ = ["Splitter", "excerpt"]
 S = TypeVar("S", Moves, Events)
 R = TypeVar("R")
 
-WILD_FEED_MM, WILD_RATIO = 10.0, 5.0
+PURGE_FEED_MM, PURGE_RATIO = 10.0, 5.0
 """A move that feeds more filament than the first, and per mm of path more than the second, counts
-as an extruder move: X and Y creep, and would be cut into thousands of segments."""
+as an extruder move: X and Y hardly move, and would be cut into thousands of segments."""
 
 _AHEAD = 1.25
 """Time planned before a piece is cut, relative to its longest duration."""
@@ -69,13 +69,13 @@ class Splitter:
         self._compensate = compensate
         self._moves: Moves | None = None
         self._events: Events | None = None
-        self._raw = np.zeros(0, dtype=bool)
+        self._stays = np.zeros(0, dtype=bool)
         self._text = b""
         self._text_offset = 0
         self._after_mark = False
         self._tables: tuple[list[Limits], list[ModalState]] = ([], [])
-        self._theirs: list[Limits] | None = None
-        self._front: tuple[list[Limits], list[ModalState]] = ([], [])
+        self._interpreter_limits: list[Limits] | None = None
+        self._held_tables: tuple[list[Limits], list[ModalState]] = ([], [])
         self._limits_id = 0
         self._modal_id = 0
 
@@ -90,12 +90,12 @@ class Splitter:
             yield from self._cut(final=True)
 
     def _append(self, block: ProgramBlock) -> None:
-        if block.limits is not self._theirs:
-            self._front = self._rows_in_use()
-            self._theirs = block.limits
+        if block.limits is not self._interpreter_limits:
+            self._held_tables = self._rows_in_use()
+            self._interpreter_limits = block.limits
         moves, events = block.moves, block.events
         self._tables = block.limits, block.modal
-        limits, modal = self._front
+        limits, modal = self._held_tables
         if limits:
             # What is held keeps its rows, and those of the interpreter's new tables follow.
             self._tables = limits + block.limits, modal + block.modal
@@ -104,13 +104,13 @@ class Splitter:
         local = _shifted(events, -block.first_move)
         raw = self._raw_moves(block, local)
         if self._moves is None or self._events is None:
-            self._moves, self._events, self._raw = moves, local, raw
+            self._moves, self._events, self._stays = moves, local, raw
             self._text, self._text_offset = block.text, block.text_offset
             return
         local = _shifted(local, len(self._moves))
         self._moves = joined([self._moves, moves])
         self._events = joined([self._events, local])
-        self._raw = np.concatenate([self._raw, raw])
+        self._stays = np.concatenate([self._stays, raw])
         # A block's text covers its lines and may begin before the end of what we hold.
         held = self._text_offset + len(self._text)
         self._text += block.text[held - block.text_offset :]
@@ -118,7 +118,7 @@ class Splitter:
     def _rows_in_use(self) -> tuple[list[Limits], list[ModalState]]:
         """Return the rows of the tables that what is held needs, and number it by them."""
         moves, events = self._moves, self._events
-        if self._theirs is None:
+        if self._interpreter_limits is None:
             return [], []
         limits_ids, modal_ids = (
             [np.array([self._limits_id], np.int32)],
@@ -179,7 +179,7 @@ class Splitter:
         length = np.sqrt(np.sum(travel[:, :3] ** 2, axis=1))
         raw |= xy & (length > self._longest_s * moves.speed_mm_s)
         feed = np.abs(travel[:, 3])
-        raw |= xy & (feed > WILD_FEED_MM) & (feed > WILD_RATIO * length)
+        raw |= xy & (feed > PURGE_FEED_MM) & (feed > PURGE_RATIO * length)
         # After an object mark the firmware may skip lines: keep that travel as sliced.
         marks = events.move_index[events.kind == EventKind.OBJECT]
         if self._after_mark:
@@ -202,7 +202,7 @@ class Splitter:
             moves, events = self._moves, self._events
             count = len(moves)
             travel, xy = moves.end_mm - moves.start_mm, moves.moves_xy
-            ours = np.flatnonzero(xy & ~self._raw) if self._compensate else np.zeros(0, np.int64)
+            ours = np.flatnonzero(xy & ~self._stays) if self._compensate else np.zeros(0, np.int64)
             if len(ours) == 0:
                 yield self._take(None)
                 return
@@ -210,7 +210,7 @@ class Splitter:
             if head > 0 or (len(events) and events.byte_start[0] < moves.byte_start[0]):
                 yield self._take(int(moves.byte_start[head]))
                 continue
-            kept = np.flatnonzero(self._raw)
+            kept = np.flatnonzero(self._stays)
             lasting_s = np.cumsum(_shortest_s(moves))
             most = min(self._most_moves(moves, events), self._enough(moves, lasting_s))
             barrier = self._first_barrier(events, most)
@@ -223,13 +223,13 @@ class Splitter:
             phases = self._plan(rows_of(moves, slice(0, last)))
             if len(phases) != last or not np.all(np.any(travel[:last] != 0.0, axis=1)):
                 # A move of zero length has no plan; leave its neighbourhood unchanged.
-                self._raw[:last] |= xy[:last]
+                self._stays[:last] |= xy[:last]
                 continue
             slow = phases.lasts_s > self._longest_s
             if np.any(slow & xy[:last]):
                 # Slower under the limits in force than their F says.
                 lines = moves.line[:last]
-                self._raw[:last] |= xy[:last] & np.isin(lines, lines[slow])
+                self._stays[:last] |= xy[:last] & np.isin(lines, lines[slow])
                 continue
             if phases.end_s[-1] <= self._longest_s:
                 if not closed:
@@ -301,7 +301,7 @@ class Splitter:
         )
         self._text = self._text[len(text) :]
         self._text_offset = until
-        self._raw = self._raw[m:]
+        self._stays = self._stays[m:]
         if m == len(moves) and e == len(events):
             self._moves = self._events = None
         else:

@@ -51,8 +51,8 @@ class Timeline:
     rests : ndarray of int64, shape (k, 2)
         Ranges [a, b) of samples in which u(i) = u(i - 1) must hold; the path stands at a - 1.
     start_s, end_s : ndarray, shape (len(groups),)
-        When each group starts and ends, standing time before and after a stretch included, in which
-        a command may move already; a stretch is padded to the grid at its end.
+        Start and end of each group [s]. A stretch includes the standing time lead_s and tail_s, in
+        which the command may already move; its end is rounded up to the grid.
     group_start_mm : ndarray, shape (len(groups), 4)
         x y z e where each group starts.
     row_start_s : ndarray, shape (rows,)

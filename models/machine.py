@@ -212,6 +212,8 @@ class Machine(Document):
                     del about[added]
         if not content["firmware"].get("ft_motion", True):
             del content["firmware"]["ft_motion"]
+        if not content["firmware"].get("macros", True):
+            del content["firmware"]["macros"]
         if content["firmware"].get("ft_motion_version") == 2:
             del content["firmware"]["ft_motion_version"]
         document = json.dumps(content, sort_keys=True, separators=(",", ":"))

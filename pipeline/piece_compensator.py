@@ -118,7 +118,9 @@ class PieceCompensator:
         command = machine.command
         steps = [command.of(axis).speed_step_mm_s for axis in ("x", "y")]
         # One limit serves both axes: the motion of an axis with a higher limit is scaled down.
-        self._of_a_step = np.array([*(command.speed_step_mm_s / step for step in steps), 1.0, 1.0])
+        self._direction_scale = np.array(
+            [*(command.speed_step_mm_s / step for step in steps), 1.0, 1.0]
+        )
         self._grid = OperatingGrid(machine, step=DESIGN_STEP, blend_step=BLEND_STEP)
         self._level: OperatingPoint | None = None
 
@@ -277,7 +279,7 @@ class PieceCompensator:
             phases.start_mm_s,
             phases.cruise_mm_s,
             phases.accel_mm_s2,
-            phases.direction * self._of_a_step,
+            phases.direction * self._direction_scale,
             max(self._step_mm[:2]),
             # Ramps are shorter than a motor step there, so the motor does not notice them.
             max(self._step_mm) > 0.0,

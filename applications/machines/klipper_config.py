@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
+from stillpath.gcode.firmware.klipper.dialect import FOREIGN
 from stillpath.models.errors import ModelError
 from stillpath.models.user_files import read_bytes
 
@@ -136,7 +137,7 @@ def facts(config: PrinterConfig) -> list[Fact]:
 
     If other files are included, sections that are missing altogether yield no facts.
     """
-    known = [_printer, _travel, _extruder, _shaper, _retraction, _arcs]
+    known = [_printer, _travel, _extruder, _shaper, _retraction, _arcs, _macros]
     return [fact for find in known for fact in find(config)]
 
 
@@ -295,6 +296,15 @@ def _arcs(config: PrinterConfig) -> list[Fact]:
         Fact(section, "", "firmware.arcs", True),
         Fact(section, "resolution", "firmware.arc_resolution_mm", resolution),
     ]
+
+
+def _macros(config: PrinterConfig) -> list[Fact]:
+    """Macros that would otherwise be taken for words of another firmware."""
+    named = {section.partition("gcode_macro ")[2].strip().upper() for section in config.sections}
+    macros = sorted(named & FOREIGN.keys())
+    if not macros and config.includes:
+        return []
+    return [Fact("gcode_macro", "", "firmware.macros", macros)]
 
 
 def _numbers(

@@ -23,8 +23,8 @@ from stillpath.models.jit import kernel
 
 __all__ = [
     "MOST_PLACES",
-    "Answer",
     "Places",
+    "Response",
     "Rules",
     "choose_vertices",
     "hop",
@@ -109,7 +109,7 @@ class Rules(NamedTuple):
     corexy: bool
 
 
-class Answer(NamedTuple):
+class Response(NamedTuple):
     """The printer's response to an error e, for X and for Y.
 
     It is direct e + sum of Re(weight x), x <- pole x + e.
@@ -276,7 +276,7 @@ def choose_vertices(
     command: Any,
     heading: Any,
     rules: Rules,
-    answer: Answer,
+    response: Response,
     chosen: Any,
 ) -> bool:
     """Choose the vertices of a stretch and their places.
@@ -303,7 +303,7 @@ def choose_vertices(
     -----
     No segment goes straight back along the one before it in a slow place.
     """
-    n, width = len(places.place), 2 * answer.pole.shape[1]
+    n, width = len(places.place), 2 * response.pole.shape[1]
     search = _Search(
         np.full((n, MOST_PLACES), np.inf),
         np.full((n, MOST_PLACES), np.inf),
@@ -314,7 +314,7 @@ def choose_vertices(
         np.empty(width),
         np.empty(_WAYS),
     )
-    return _follow(places, z, command, heading, rules, answer, search, chosen)
+    return _follow(places, z, command, heading, rules, response, search, chosen)
 
 
 @kernel(allocates=False)
@@ -324,14 +324,14 @@ def _follow(
     command: Any,
     heading: Any,
     rules: Rules,
-    answer: Answer,
+    response: Response,
     search: _Search,
     chosen: Any,
 ) -> bool:
     """See `choose_vertices`."""
     place, place_at, count, slow = places
     least, unit, step, spare, bend, corexy = rules
-    pole, weight, direct, energy = answer
+    pole, weight, direct, energy = response
     cost, rank, came, states, ways, n_ways, x, kept = search
     n, order = len(place), pole.shape[1] // 2
     width, gentle = 4 * order, bend[1] / bend[0]
@@ -402,7 +402,7 @@ def _follow(
                     fed_per = (_fed(command, place_at[k, c]) - fed) * per
                     while s <= end and total < most:
                         t = s - begin
-                        answer_along = error_along = square = 0.0
+                        response_along = error_along = square = 0.0
                         for axis in range(2):
                             start, leg = (from_x, bx) if axis == 0 else (from_y, by)
                             error = start + leg * per * t - command[s, axis]
@@ -416,9 +416,9 @@ def _follow(
                             said, error = said * unit[axis], error * unit[axis]
                             total += said * said + _SEEN * error * error
                             square += error * error
-                            answer_along += heading[s, axis] * said
+                            response_along += heading[s, axis] * said
                             error_along += heading[s, axis] * error
-                        along = answer_along * answer_along + _SEEN * error_along * error_along
+                        along = response_along * response_along + _SEEN * error_along * error_along
                         total += max(square - _FAR, 0.0) - (1.0 - _ALONG) * along
                         gap = fed + fed_per * t - command[s, 2]
                         total += gap * gap

@@ -22,7 +22,7 @@ _TRAILING = np.array(
 def printed_feedrate(f: float, whole_from: float = np.inf) -> float:
     """F rounded to the decimals that `format_moves` prints: about six significant digits.
 
-    None from `whole_from` on, where a planner keeps time whatever F is rounded to.
+    No decimals from `whole_from` on: there the planner keeps time however F is rounded.
     """
     digits = 10.0 if f >= 100.0 else 1000.0 if f >= 1.0 else 1e5
     if f >= whole_from:

@@ -6,7 +6,16 @@ import re
 
 from stillpath.gcode.firmware.base import StreamCommands
 
-__all__ = ["AXES", "EXTRUSION", "FEED", "NUMBERED", "POSITIONING", "SET_POSITION", "LineReader"]
+__all__ = [
+    "AXES",
+    "EXTRUSION",
+    "FEED",
+    "NUMBERED",
+    "POSITIONING",
+    "SET_POSITION",
+    "STANDS",
+    "LineReader",
+]
 
 AXES = re.compile(rb"[XYZ]", re.IGNORECASE)
 FEED = re.compile(rb"F\s*\+?[0.]*[1-9]", re.IGNORECASE)
@@ -15,6 +24,12 @@ SET_POSITION = re.compile(rb"^\s*(?:N\d+\s*)?G92(?!\d)")
 POSITIONING = re.compile(rb"^\s*(?:N\d+\s*)?G\s*0*9[01](?!\d)")
 EXTRUSION = re.compile(rb"^\s*(?:N\d+\s*)?M\s*0*8[23](?!\d)")
 NUMBERED = re.compile(rb"^\s*N\d+\s*")
+STANDS = re.compile(
+    rb"^\s*(?:N\d+\s*)?(?:G\s*0*4|M\s*0*400)(?![\d.])[^GMT;]*(?:;|$)", re.IGNORECASE
+)
+"""G4 or M400 and nothing else: the motion rests before and after it, on every printer. Other lines
+may stop it or not: Klipper's M109 does only while the heater is not hot, Marlin's M114 only in some
+builds (always in old versions, later with M114_LEGACY), and a macro may leave the head moving."""
 
 _MOVE = re.compile(rb"^\s*(?:N\d+\s*)?(?:G-?0*[0-35](?![\d.])|[XYZEIJK]\s*[-+.\d])", re.IGNORECASE)
 _MOVE_WITH_SUBCODE = re.compile(rb"^\s*(?:N\d+\s*)?G-?0*[0-35]\.\d", re.IGNORECASE)

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from stillpath.gcode._segment_kernels import path_directions
 from stillpath.gcode.firmware._vertex_kernels import (
     MOST_PLACES,
-    Answer,
     Places,
+    Response,
     Rules,
     choose_vertices,
     list_places,
@@ -43,14 +43,18 @@ class Lattice:
         First and last step of X and Y.
     least : int
         Fewest steps of a move.
+    corexy : bool
+        The motors are A = X + Y and B = X - Y.
     speed_step_mm_s : float
         Largest step of a motor's speed.
     spare_steps : float
         Steps within a segment that rounding may add to that.
+    accel_mm_s2 : float
+        Largest acceleration that moves ask for.
     moves_per_s : float
         Rate at which moves arrive.
     fast_mm_s, fast_accel_mm_s2 : float
-        Motor speed above which moves should need no more than this acceleration.
+        Moves with a motor speed above `fast_mm_s` should need no more than `fast_accel_mm_s2`.
     """
 
     per_mm: NDArray[np.float64]
@@ -111,14 +115,14 @@ def vertices_on_steps(lattice: Lattice, timeline: Timeline, segments: Segments) 
         The last vertex of a stretch stays where it is. All moves have `lattice.least` steps, but
         for a stretch where there is no such choice: its vertices are rounded.
     """
-    answer = _answer_of(segments.error_filter)
+    response = _response_of(segments.error_filter)
     direction = np.empty((2, timeline.position_mm.shape[1]))
     path_directions(timeline.position_mm[:2], direction)
     end_s, end_mm, groups = [], [], []
     for group, rows in segments.stretches():
         at_s = np.append(timeline.start_s[group], segments.end_s[rows])
         at_mm = np.vstack([timeline.group_start_mm[group], segments.end_mm[:, rows].T])
-        at_s, at_mm = _chosen(lattice, timeline.dt_s, at_s, at_mm, answer, direction)
+        at_s, at_mm = _chosen(lattice, timeline.dt_s, at_s, at_mm, response, direction)
         end_s.append(at_s[1:])
         end_mm.append(at_mm[1:])
         groups.append(np.full(len(at_s) - 1, group, np.int64))
@@ -130,7 +134,7 @@ def vertices_on_steps(lattice: Lattice, timeline: Timeline, segments: Segments) 
     )
 
 
-def _answer_of(errors: ErrorFilter | None) -> Answer:
+def _response_of(errors: ErrorFilter | None) -> Response:
     pole, weight, direct = np.zeros((2, 1), complex), np.zeros((2, 1), complex), np.ones(2)
     if errors is not None:
         pole, weight, direct = errors.pole, errors.weight, errors.direct
@@ -143,7 +147,7 @@ def _answer_of(errors: ErrorFilter | None) -> Answer:
         unit = np.kron(np.eye(len(p)), [1.0, 1j])
         form = (unit.T @ (plain @ unit + crossed @ unit.conj())).real
         energy.append(0.5 * (form + form.T))
-    return Answer(_parts(pole), _parts(weight), np.asarray(direct), np.stack(energy))
+    return Response(_parts(pole), _parts(weight), np.asarray(direct), np.stack(energy))
 
 
 def _parts(values: NDArray[np.complex128]) -> NDArray[np.float64]:
@@ -210,7 +214,7 @@ def _chosen(
     dt_s: float,
     at_s: NDArray[np.float64],
     at_mm: NDArray[np.float64],
-    answer: Answer,
+    response: Response,
     direction: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Vertices of one stretch and its start, times (n,) and places (n, 4)."""
@@ -236,7 +240,7 @@ def _chosen(
     )
     chosen = np.zeros(n, np.int64)
     rules = lattice.rules(dt_s)
-    if not choose_vertices(places, near.z, near.command, heading, rules, answer, chosen):
+    if not choose_vertices(places, near.z, near.command, heading, rules, response, chosen):
         at_mm[1:-1, :2] = np.round(at_mm[1:-1, :2] * scale[:2]) / scale[:2]
         return at_s, at_mm
     keep = np.flatnonzero(chosen >= 0)

@@ -24,6 +24,7 @@ from stillpath.gcode.firmware.line_reader import (
     FEED,
     POSITIONING,
     SET_POSITION,
+    STANDS,
     LineReader,
 )
 from stillpath.gcode.firmware.planning import stops
@@ -37,7 +38,7 @@ FILE_SETS_SHAPER = "The file sets the firmware's input shaper"
 
 _BYTES_PER_LINE = 96
 _LEVEL, _EVENT, _REST = range(3)
-_SHAPED = (EventKind.UNKNOWN, EventKind.SHAPER)
+_MAY_SET_SHAPER = (EventKind.UNKNOWN, EventKind.SHAPER)
 _LEAST_GAP_MM = 1e-7
 _FAR_MM = 10.0
 """32-bit floats resolve a micrometre up to here."""
@@ -148,7 +149,7 @@ class StreamWriter:
         lead = self._off(verbatim, extruder_mm)
         if self._marked is not None:
             self._marked = verbatim.limits_after
-        for row in np.flatnonzero(np.isin(events.kind, _SHAPED)).tolist():
+        for row in np.flatnonzero(np.isin(events.kind, _MAY_SET_SHAPER)).tolist():
             line = verbatim.line(events, row)
             conflict = self._stream_commands.conflict(line)
             if conflict is not None:
@@ -157,12 +158,8 @@ class StreamWriter:
                 continue  # a line that also moves cannot be repeated
             self._shaper_off = False
             self._file_shapers.note(line, int(events.line[row]))
-        if len(moves):
-            last_stop = events.move_index[stops(events)]
-            stands = len(last_stop) > 0 and int(last_stop[-1]) == len(moves)
-            self._at_rest = stands or self._rests(verbatim, len(moves) - 1)
-        elif np.any(stops(events)):
-            self._at_rest = True
+        if len(moves) or np.any(stops(events)):
+            self._at_rest = self._rests(verbatim, at_end=True)
         return lead + verbatim.text
 
     def piece(self, piece: Piece, encoded: Encoded, extruder_mm: float) -> bytes:
@@ -187,7 +184,10 @@ class StreamWriter:
         for at, kind, what in sorted(order):
             upto = int(line_end[at - 1]) if at else 0
             if upto > done:
-                parts += [self._ours(limits[level[at - 1]], modes.at(at - 1)), text[done:upto]]
+                parts += [
+                    self._enter_stream_state(limits[level[at - 1]], modes.at(at - 1)),
+                    text[done:upto],
+                ]
                 done = upto
             written = float(extruded[at - 1] if at else piece.moves.start_mm[0, 3])
             if kind == _EVENT:
@@ -196,7 +196,10 @@ class StreamWriter:
                 last_line = int(piece.moves.line[what])
                 parts.append(self._rest_line(piece, what, written))
         if len(text) > done:
-            parts += [self._ours(limits[level[-1]], modes.at(len(rows) - 1)), text[done:]]
+            parts += [
+                self._enter_stream_state(limits[level[-1]], modes.at(len(rows) - 1)),
+                text[done:],
+            ]
         last = piece.moves.speed_mm_s[-1]
         self._file_feed_mm_min = float(last) * 60.0 / piece.modal_after.speed_factor
         self._at_rest = False
@@ -320,10 +323,10 @@ class StreamWriter:
         lines = self._stream_commands.limits(limits).splitlines(keepends=True)
         return b"".join(line for line in lines if line not in known.splitlines(keepends=True))
 
-    def _ours(self, limits: Limits, ours: ModalState) -> bytes:
+    def _enter_stream_state(self, limits: Limits, modes: ModalState) -> bytes:
         """Return lines that set the stream's limits and modes."""
-        text = self._limits_to(limits) + self._file_modes(ours)
-        self._modal = ours
+        text = self._limits_to(limits) + self._file_modes(modes)
+        self._modal = modes
         if self._far_mm is not None:
             self._zero_mm += self._far_mm
             self._far_mm = None
@@ -393,9 +396,7 @@ class StreamWriter:
         shaper = self._shaper_before(verbatim)
         if not self._streaming:
             return self._unmarked() + shaper
-        stop = (
-            b"" if self._at_rest or self._rests(verbatim, 0) else self._stream_commands.stand_still
-        )
+        stop = b"" if self._at_rest or self._rests(verbatim) else self._stream_commands.stand_still
         limits = verbatim.limits_before
         if self._shaper_off and self._shaper_is_known:
             self._marked, limits = limits, self._stream_commands.in_stream(limits)
@@ -410,15 +411,17 @@ class StreamWriter:
         limits, self._marked = self._marked, None
         return self._stream_commands.limits(limits)
 
-    def _rests(self, verbatim: VerbatimPart, row: int) -> bool:
-        """Return whether the machine stands still anyway before and after a move."""
+    def _rests(self, verbatim: VerbatimPart, *, at_end: bool = False) -> bool:
+        """Return whether the machine certainly stands before a part, or after it."""
         moves, events = verbatim.moves, verbatim.events
-        rests = stops(events)
+        edge, nearest = (len(moves), -1) if at_end else (0, 0)
+        stop_rows = np.flatnonzero(stops(events) & (events.move_index == edge))
+        if len(stop_rows):
+            line = verbatim.line(events, int(stop_rows[nearest]))
+            return STANDS.match(line) is not None
         if len(moves) == 0:
-            return bool(np.any(rests))
-        if row == 0 and np.any((events.move_index == 0) & rests):
-            return True
-        travel = moves.end_mm[row] - moves.start_mm[row]
+            return False
+        travel = moves.end_mm[nearest] - moves.start_mm[nearest]
         return self._extruder_alone_stops and not np.any(travel[:3])
 
     def _end(self, extruder_mm: float) -> bytes:
@@ -449,7 +452,7 @@ class StreamWriter:
         """
         prints = bool(np.any(verbatim.moves.prints))
         # A line that sets part of the shaper must find the other parts unchanged.
-        foreign = bool(np.any(np.isin(verbatim.events.kind, _SHAPED)))
+        foreign = bool(np.any(np.isin(verbatim.events.kind, _MAY_SET_SHAPER)))
         aside = isinstance(verbatim, LeftOut)  # between streams again and again
         if (prints and not aside) or foreign:
             return self._shaper_on(verbatim.limits_before)

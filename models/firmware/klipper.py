@@ -53,6 +53,9 @@ class Klipper(FirmwareFacts):
     extruder: Extruder = Extruder()
     shaper: FirmwareShaper | None = None
     """None: unknown. It is switched off for our moves and stays off, and the report says so."""
+    macros: tuple[str, ...] = ()
+    """Configured macros with the name of another firmware's word, such as M205 or M900: they may do
+    anything."""
 
     @property
     def hotend(self) -> Hotend:

@@ -168,6 +168,12 @@ class Marlin(FirmwareFacts):
         return self
 
     @property
+    def shortest_move_mm(self) -> float:
+        """Shortest move along X or Y that is not swallowed (MIN_STEPS_PER_SEGMENT)."""
+        scale = self.steps_per_mm
+        return self.min_steps_per_segment * max(1.0 / scale.x, 1.0 / scale.y)
+
+    @property
     def hotend(self) -> Hotend:
         """Nozzle and filament."""
         return self.extruder

@@ -32,7 +32,8 @@ class LastCheckError(Exception):
         )
 
     def __reduce__(self) -> tuple[object, ...]:
-        return _rebuilt, (self.args[0], self.line, self.written_line, self.reason)
+        of_message = (self.args[0], self.line, self.written_line, self.reason)
+        return _rebuilt, of_message, {"stream_line": self.stream_line}
 
 
 def _rebuilt(text: str, line: int, written_line: int, reason: str) -> LastCheckError:

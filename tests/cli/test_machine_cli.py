@@ -48,6 +48,13 @@ gcode:
   [printer]
   max_accel: 1
   G28
+[gcode_macro m900]
+gcode:
+  SET_PRESSURE_ADVANCE ADVANCE={params.K}
+[gcode_macro M106]
+rename_existing: M106.1
+gcode:
+  M106.1 S{params.S}
 [input_shaper]
 shaper_type_x: ei
 #*# <---------------------- SAVE_CONFIG ---------------------->
@@ -219,6 +226,7 @@ def test_a_machine_from_a_printer_cfg(store: MachineStore, config: Path, capsys)
     assert extruder.max_extrude_only_accel_mm_s2 == pytest.approx(4000 * 1.44 / 2.40528, rel=1e-5)
     assert machine.pressure_advance_s == 0.04
     assert machine.firmware.arc_resolution_mm == 0.1
+    assert machine.firmware.macros == ("M900",)
     shaper = machine.firmware.shaper
     assert shaper is not None
     assert (shaper.type_x, shaper.freq_x_hz, shaper.type_y) == ("ei", 61.2, "2hump_ei")

@@ -456,6 +456,15 @@ def test_a_macro_of_that_name_is_the_users(read) -> None:
     assert read("G2 X9 I2\nG10\n", "klipper", **macros)[1].warnings == []
 
 
+def test_a_limit_of_older_klippers_is_told_once(read) -> None:
+    line = "SET_VELOCITY_LIMIT ACCEL=2000 ACCEL_TO_DECEL=1000"
+    _, interpreter = read(f"G1 X5 F600\n{line}\n{line} ; again\n", "klipper")
+    (said,) = interpreter.warnings
+    assert said.startswith("line 2: ACCEL_TO_DECEL is not followed")
+    # Lines for old and new Klippers, such as a stream's.
+    assert read(f"{line} MINIMUM_CRUISE_RATIO=.5\n", "klipper")[1].warnings == []
+
+
 @pytest.mark.parametrize(
     ("line", "given", "how"),
     [

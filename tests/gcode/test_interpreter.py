@@ -143,6 +143,10 @@ def test_quarter_arc_and_circle(golden_machine: Machine) -> None:
         ("M220 S0", "above 0"),
         ("G4 P-5", "value -5 is .*P of G4"),
         ("RESTORE_GCODE_STATE NAME=none", "SAVE_GCODE_STATE"),
+        (
+            "\n".join(f"SAVE_GCODE_STATE NAME={max(0, k)}" for k in range(-9, 1001)),
+            "more than 1000 names; use a name again",
+        ),
         ("SET_VELOCITY_LIMIT ACCEL=0", "above 0"),
         ("SET_VELOCITY_LIMIT ACCEL=nan", "out of range"),
         ('SET_VELOCITY_LIMIT ACCEL="5', "quote"),
@@ -185,7 +189,8 @@ def test_classes(wary_machine: Machine) -> None:
         "": EventKind.HARMLESS,
         "M106 S255": EventKind.HARMLESS,
         "M104 S200": EventKind.HARMLESS,
-        "SET_PRESSURE_ADVANCE ADVANCE=0.05": EventKind.HARMLESS,
+        "SET_PRESSURE_ADVANCE ADVANCE=0.05": EventKind.STOP,
+        "SET_PRESSURE_ADVANCE ADVANCE=0.06": EventKind.HARMLESS,
         "M117 G1 X500 Y500 ; not a move": EventKind.HARMLESS,
         "M117 100% done (really)": EventKind.HARMLESS,
         'RESPOND MSG="G1 X1; quoted"': EventKind.HARMLESS,
@@ -197,6 +202,8 @@ def test_classes(wary_machine: Machine) -> None:
         "G1 F1800": EventKind.MODE,
         "G21": EventKind.HARMLESS,
         "M400": EventKind.STOP,
+        "M119": EventKind.STOP,
+        "QUERY_ENDSTOPS": EventKind.STOP,
         "M109 S200": EventKind.STOP,
         "TEMPERATURE_WAIT SENSOR=extruder MINIMUM=5": EventKind.STOP,
         "G4 P200": EventKind.STOP,
@@ -215,8 +222,8 @@ def test_classes(wary_machine: Machine) -> None:
     }
     block = run("\n".join(expected) + "\n", wary_machine)
     assert dict(zip(expected, kinds(block), strict=True)) == expected
-    # The dwell, and for the shaper twice the time that pressure advance looks ahead.
-    assert block.events.dwell_s.sum() == pytest.approx(0.2 + 0.04)
+    # The dwell, and how far pressure advance looks ahead: after none, and twice for the shaper.
+    assert block.events.dwell_s.sum() == pytest.approx(0.2 + 0.021 + 0.04)
 
 
 def test_a_shaper_with_much_damping_makes_klipper_stand_longer(golden_machine: Machine) -> None:
@@ -233,14 +240,44 @@ def test_a_shaper_with_much_damping_makes_klipper_stand_longer(golden_machine: M
     assert stands[0.3] - stands[0.05] > 1.5e-3
 
 
+@pytest.mark.parametrize(
+    ("line", "dwell_s"),
+    [
+        ("ADVANCE=0", 0.021),
+        ("ADVANCE=.07", None),
+        ("ADVANCE=.05 SMOOTH_TIME=.04 EXTRUDER=extruder", None),
+        ("SMOOTH_TIME=.1", 0.07),
+        ("SMOOTH_TIME=0", 0.021),
+        ("ADVANCE=.05 EXTRUDER=extruder1", None),
+        ("SMOOTH_TIME=.1 EXTRUDER=extruder1", 0.07),
+        # Nothing changes for the extruder in use, which looks ahead as before.
+        ("ADVANCE=0 EXTRUDER=extruder1", 0.04),
+        ("ADVANCE=0 EXTRUDER=my_stepper", 0.04),
+    ],
+)
+def test_klipper_stands_where_pressure_advance_averages_over_another_time(
+    line: str, dwell_s: float | None, golden_machine: Machine
+) -> None:
+    machine = golden_machine.model_copy(update={"pressure_advance_s": 0.05})
+    block = run(f"SET_PRESSURE_ADVANCE {line}\n" * 2, machine)
+    again = line.endswith("my_stepper")
+    stop, harmless = EventKind.STOP, EventKind.HARMLESS
+    assert kinds(block) == [harmless if dwell_s is None else stop, stop if again else harmless]
+    assert block.events.dwell_s[0] == pytest.approx(dwell_s or 0.0)
+
+
 def test_macros_that_the_machine_declares(wary_machine: Machine) -> None:
     firmware = wary_machine.firmware.model_copy(
-        update={"harmless_macros": ("_on_layer",), "stopping_macros": ("CLEAN", "M600")}
+        update={
+            "harmless_macros": ("_on_layer",),
+            "stopping_macros": ("CLEAN", "M600"),
+            "macros": ("M900", "M106"),  # not Klipper's own commands
+        }
     )
     machine = wary_machine.model_copy(update={"firmware": firmware})
-    block = run("_ON_LAYER LAYER=1\nCLEAN\nm600\nOTHER\n", machine)
-    stop = EventKind.STOP
-    assert kinds(block) == [EventKind.HARMLESS, stop, stop, EventKind.UNKNOWN]
+    block = run("_ON_LAYER LAYER=1\nCLEAN\nm600\nOTHER\nM900 K5\nM205 X8\nM106\n", machine)
+    harmless, stop, unknown = EventKind.HARMLESS, EventKind.STOP, EventKind.UNKNOWN
+    assert kinds(block) == [harmless, stop, stop, unknown, unknown, harmless, harmless]
 
 
 def test_a_printer_without_macros_still_has_klippers_own_commands(golden_machine: Machine) -> None:

@@ -17,7 +17,7 @@ from stillpath.gcode.firmware.marlin._encoder_kernels import (
     bend_reversals,
     thin,
 )
-from stillpath.gcode.firmware.marlin.adapter import MarlinAdapter
+from stillpath.gcode.firmware.marlin.adapter import STEEPEST_MESH, MarlinAdapter
 from stillpath.gcode.firmware.marlin.encoder import stream_limits
 from stillpath.gcode.firmware.marlin.limits import MarlinLimits, initial_limits
 from stillpath.gcode.firmware.marlin.stream_commands import MarlinStreamCommands
@@ -158,6 +158,7 @@ def test_the_shaper_of_the_firmware() -> None:
         )
     # Nobody says whether there is one: off it goes, and the pipeline warns.
     unknown = MarlinStreamCommands(Marlin())
+    assert unknown.acceleration(1e6) == b"M204 P1000000 T1000000\n"
     assert (unknown.shaper_off, unknown.shaper_on) == (b"M593 F0\n", None)
 
 
@@ -170,6 +171,10 @@ def test_the_shaper_of_the_firmware() -> None:
         ({"ft_motion": True}, "M493 S0"),
         ({"board": "avr"}, "8-bit"),
         ({"min_steps_per_segment": 20}, "MIN_STEPS_PER_SEGMENT 1"),
+        (
+            {"min_steps_per_segment": 6, "steps_per_mm": PerAxis(x=160, y=40, z=400, e=93)},
+            "below 6 steps (150 um)",
+        ),
         ({"planner": MarlinPlanner(junction_deviation_mm=0.005)}, "M205 J takes 0.01 to 0.3 mm"),
     ],
 )
@@ -179,6 +184,17 @@ def test_what_cannot_be_executed_is_refused(facts: dict[str, Any], says: str) ->
     assert refusal is not None
     assert says in refusal
     assert "method advise" in refusal
+
+
+def test_the_document_says_how_steep_a_bed_mesh_may_be() -> None:
+    document = (Path(__file__).parents[2] / "docs" / "marlin.md").read_text()
+    assert f"a bed mesh steeper than {STEEPEST_MESH:g} " in document
+
+
+def test_the_coarser_axis_says_what_is_swallowed() -> None:
+    coarse_y = {"min_steps_per_segment": 6, "steps_per_mm": PerAxis(x=160, y=80, z=400, e=93)}
+    notes = MarlinStreamCommands(FIRMWARE.model_copy(update=coarse_y)).notes
+    assert any("6 steps (75 um)" in note for note in notes)
 
 
 @pytest.mark.parametrize("per_mm", [80.0, 160.0])

@@ -93,6 +93,8 @@ def test_extruder_refuses() -> None:
     steps = np.array([[1.0, 0, 0, 1.0]])
     with pytest.raises(GcodeError, match=r"2.405 mm2.*0.640 mm2"):
         plan_moves(moves_of(steps, np.full(1, 60.0), np.zeros(1, np.int64)), LIMITS, FIRMWARE)
+    with pytest.raises(GcodeError, match=r"line 1: .*speed is 0 mm/s.*correct its F"):
+        plan_moves(moves_of(steps, np.zeros(1), np.zeros(1, np.int64)), LIMITS, FIRMWARE)
 
 
 def test_stops_of_a_block(golden_machine: Machine) -> None:

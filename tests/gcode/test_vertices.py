@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from stillpath.gcode.firmware import _vertex_kernels as kernels
-from stillpath.gcode.firmware.vertices import Lattice, _answer_of, vertices_on_steps
+from stillpath.gcode.firmware.vertices import Lattice, _response_of, vertices_on_steps
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.segments import ErrorFilter, Segments
 from stillpath.gcode.timeline import Timeline
@@ -241,7 +241,9 @@ def test_the_choice_is_nearly_the_best_of_all() -> None:
         places = kernels.Places(place, place_at, count, np.ones(n, np.bool_))
         bend = np.array([1e9, 1e9, np.inf])
         rules = kernels.Rules(6, np.ones(2), np.full(2, np.inf), 1.0, bend, False)
-        assert kernels.choose_vertices(places, z, command, heading, rules, _answer_of(SOFT), chosen)
+        assert kernels.choose_vertices(
+            places, z, command, heading, rules, _response_of(SOFT), chosen
+        )
 
         def cost(
             which: tuple[int, ...],

@@ -267,6 +267,34 @@ def test_after_homing_the_machine_stands_still(pipeline: Pipeline) -> None:
     assert ours.contour_max_um < 0.3 * sliced.contour_max_um
 
 
+@pytest.mark.parametrize(
+    ("between", "before", "after"),
+    [
+        ("M400", False, False),
+        ("N7 G4 P0*4 ; M109", False, False),
+        ("M109 S200", True, True),  # hot already: Klipper goes on
+        ("PARK", True, True),
+        ("PARK\nM400", True, False),
+        ("M400\nPARK", False, True),
+        ("M600\nG1 X130 Y100 Z5 F6000", True, True),
+        ("SET_PRESSURE_ADVANCE ADVANCE=.05", True, True),
+    ],
+)
+def test_the_motion_rests_between_stream_and_file_whatever_a_line_does(
+    pipeline: Pipeline, machine: Machine, between: str, before: bool, after: bool
+) -> None:
+    firmware = machine.firmware.model_copy(update={"stopping_macros": ("PARK",)})
+    known = machine.model_copy(update={"firmware": firmware})
+    lines = pipeline(HEAD + ROUND + f"{between}\n" + TURN, known).splitlines()
+    own = between.encode().splitlines()
+    first, last = lines.index(own[0]), lines.index(own[-1])
+    assert lines[first - 1].startswith(OFF)
+    assert b"stream on" in lines[last + 1 + after]
+    still = b"G4 P0 ; stand still"
+    assert (still in lines[first - 5 : first]) == before
+    assert (lines[last + 1] == still) == after
+
+
 @pytest.mark.parametrize("length", ["0.0005", "0.02"])
 def test_hardly_a_move_between_two_rests(pipeline: Pipeline, length: str) -> None:
     tiny = f"G1 E-1 F2100\nG1 X{120 + float(length):.4f} F6000\nG1 E1 F2100\nG1 X130 F6000\n"

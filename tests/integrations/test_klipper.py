@@ -6,6 +6,7 @@ On an imitation, quickly and in many orders; on Klipper's own host: `test_real_m
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -95,15 +96,15 @@ def test_resume_without_a_pause_brings_nothing_back():
     assert limits(printer) == ((300.0, 5000.0, 5.0, 0.5), 57.8)
 
 
-def test_a_pause_among_the_files_own_moves_of_a_stretch():
+@pytest.mark.parametrize("corner_mm_s", [0.0, 5.0, 7.0710678, 14.14213562, 20 / 3])
+def test_a_pause_among_the_files_own_moves_of_a_stretch(corner_mm_s: float):
     """There the file's limits are in force, marked, and the shaper is off."""
     printer = Klipper(macros_of(OURS))
     machine = load_machine("voron-v24-250")
     firmware = KlipperAdapter(machine, machine.firmware)
     stream_commands = firmware.stream_commands()
-    printer.run(
-        stream_commands.limits(stream_commands.in_stream(firmware.initial_limits())).decode()
-    )
+    own = replace(firmware.initial_limits(), square_corner_velocity_mm_s=corner_mm_s)
+    printer.run(stream_commands.limits(stream_commands.in_stream(own)).decode())
     printer.run(stream_commands.shaper_off.decode())
     before = limits(printer)
     printer.run("PAUSE")

@@ -98,6 +98,29 @@ def test_the_host_plans_what_we_read_back(name: str, file: str, tmp_path: Path) 
     assert found.stand_s < 1e-6
 
 
+def test_the_host_stands_for_the_smooth_time_of_pressure_advance(tmp_path: Path) -> None:
+    machine = of_the_package(homed(load_machine("ender3")))
+    text = "G28\nG90\nM83\nG1 X10 Y10 Z5 F3000\n"
+    # The package's host is older and stands for lines that change nothing, too.
+    changes = ("ADVANCE=.05", "SMOOTH_TIME=.1", "ADVANCE=0 EXTRUDER=extruder")
+    for k, change in enumerate(changes):
+        text += f"G1 X{20 + 10 * k} E1\nSET_PRESSURE_ADVANCE {change}\n"
+    text += "G1 X100 E1\n"
+    run(text, machine, tmp_path)
+    found = compared(text, machine, recorded(tmp_path))
+    assert found.stands == len(changes)
+    assert found.stand_s < 1e-6
+    assert max(found.largest.values()) < 1e-6
+
+
+@pytest.mark.parametrize("line", ["M119", "QUERY_ENDSTOPS"])
+def test_the_host_brakes_to_ask_the_endstops(line: str, tmp_path: Path) -> None:
+    machine = of_the_package(homed(load_machine("ender3")))
+    text = f"G28\nG90\nM83\nG1 X10 Y10 Z5 F3000\nG1 X50 E1\n{line}\nG1 X90 E1\n"
+    run(text, machine, tmp_path)
+    assert max(compared(text, machine, recorded(tmp_path)).largest.values()) < 1e-6
+
+
 def test_a_file_that_the_host_did_not_get_differs(
     written: tuple[Path, Machine], tmp_path: Path
 ) -> None:

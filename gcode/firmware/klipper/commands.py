@@ -38,6 +38,7 @@ _LIMITS: dict[str, tuple[str, Callable[[float], bool], str]] = {
     ),
 }
 """Parameters of SET_VELOCITY_LIMIT: what they set, which values are allowed, and that in words."""
+_MOST_STATES = 1000
 
 
 def velocity_limit(state: MachineState, command: Command) -> int:
@@ -49,6 +50,12 @@ def velocity_limit(state: MachineState, command: Command) -> int:
             values[field] = state.number(given[key], key, command)
             if not allows(values[field]):
                 raise state.problem(f"{key}={given[key]} must be {allowed}", command)
+    if "ACCEL_TO_DECEL" in given and "MINIMUM_CRUISE_RATIO" not in given:
+        state.warn(
+            "ACCEL_TO_DECEL is not followed (Klipper ignores it since 2025-08-11): on an older one "
+            "short moves have other speeds; let the slicer write MINIMUM_CRUISE_RATIO, or update "
+            "Klipper"
+        )
     return state.set_limits(command, values)
 
 
@@ -109,6 +116,10 @@ def gcode_offset(state: MachineState, command: Command) -> int:
 def save_state(state: MachineState, command: Command) -> int:
     """SAVE_GCODE_STATE."""
     key = state.extended(command).get("NAME", "default")
+    if key not in state.saved and len(state.saved) >= _MOST_STATES:
+        raise state.problem(
+            f"it saves a state under one more than {_MOST_STATES} names; use a name again", command
+        )
     state.saved[key] = Saved(state.f.copy(), state.i.copy())
     return state.event(EventKind.STATE)
 

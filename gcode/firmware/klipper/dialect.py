@@ -3,10 +3,10 @@
 Facts: Klipper's command handlers as of 2026-08 (klippy/extras/*.py): which of them flush the
 look-ahead queue, which only attach to it (fans, heaters, pressure advance), which move.
 
-Commands are of three sorts. NATIVE ones do the same on every machine. MACRO ones exist only where
-the user configured a macro of that name, and then may do anything; a machine that says
-``unknown_commands: skip`` lacks them, and Klipper passes over what it lacks without a stop. Words
-that slicers write for other firmwares (FOREIGN) are passed over too.
+NATIVE commands do the same on every machine. Words that slicers write for other firmwares (FOREIGN)
+are passed over, unless they are among the machine's ``macros``. Names in neither table are macros,
+or unknown: they may do anything, unless the machine says ``unknown_commands: skip``; Klipper passes
+over what it lacks without a stop.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from stillpath.gcode.firmware.klipper import commands, flushing
 from stillpath.gcode.types import EventKind
 from stillpath.models.firmware import Klipper
 
-__all__ = ["klipper"]
+__all__ = ["FOREIGN", "klipper"]
 
 KERNEL_WORDS: dict[str, Word] = {
     "G0": Action.MOVE,
@@ -68,11 +68,9 @@ RETRACTION_WORDS: dict[str, Word] = {
 NATIVE: dict[str, Word] = {
     # Read back, messages, displays: the motion does not notice.
     **words(
-        "G21 M20 M23 M27 M73 M104 M105 M106 M107 M110 M114 M115 M117 M118 M119 M140 M141 "
-        "M155 M300 "
-        "ECHO HELP STATUS RESPOND SET_DISPLAY_TEXT SET_DISPLAY_GROUP GET_POSITION "
-        "GET_RETRACTION "
-        "QUERY_ENDSTOPS QUERY_ADC QUERY_FILAMENT_SENSOR SET_FILAMENT_SENSOR SET_IDLE_TIMEOUT "
+        "G21 M20 M23 M27 M73 M104 M105 M106 M107 M110 M114 M115 M117 M118 M140 M141 M155 "
+        "M300 ECHO HELP STATUS RESPOND SET_DISPLAY_TEXT SET_DISPLAY_GROUP GET_POSITION "
+        "GET_RETRACTION QUERY_ADC QUERY_FILAMENT_SENSOR SET_FILAMENT_SENSOR SET_IDLE_TIMEOUT "
         "SET_HEATER_TEMPERATURE TURN_OFF_HEATERS SET_TEMPERATURE_FAN_TARGET SET_FAN_SPEED "
         "SET_PIN SET_LED SET_LED_TEMPLATE SET_PRINT_STATS_INFO "
         "SET_GCODE_VARIABLE SAVE_VARIABLE EXCLUDE_OBJECT_DEFINE "
@@ -80,7 +78,10 @@ NATIVE: dict[str, Word] = {
         EventKind.HARMLESS,
     ),
     # Come to rest, wait, go on from the same place.
-    **words("M400 M109 M190 M191 TEMPERATURE_WAIT ACCELEROMETER_MEASURE", EventKind.STOP),
+    **words(
+        "M400 M109 M119 M190 M191 TEMPERATURE_WAIT QUERY_ENDSTOPS ACCELEROMETER_MEASURE",
+        EventKind.STOP,
+    ),
     # Homing, probing, motors off, transforms, other tools: the place or the state is lost.
     **words(
         "M18 M84 M112 PROBE PROBE_CALIBRATE PROBE_ACCURACY Z_TILT_ADJUST QUAD_GANTRY_LEVEL "
@@ -134,6 +135,7 @@ def klipper(firmware: Klipper) -> Dialect:
         **({} if firmware.arcs else NO_ARCS),
         **({} if firmware.retraction else NO_RETRACTION),
         **FOREIGN,
+        **{name.upper(): EventKind.UNKNOWN for name in firmware.macros},
         **NATIVE,
         **{name.upper(): EventKind.STOP for name in firmware.stopping_macros},
         **{name.upper(): EventKind.HARMLESS for name in firmware.harmless_macros},

@@ -2,16 +2,21 @@
 
 Steps are generated ahead of their motion, by the look-ahead of input shaper and pressure advance.
 SET_INPUT_SHAPER flushes them all: the next move starts later by the look-ahead before the command
-plus that after it.
+plus that after it. So does a SET_PRESSURE_ADVANCE that changes the time over which the extruder's
+speed is averaged, which is 0 without pressure advance. (Klipper before 2025-09-03 flushes for every
+SET_PRESSURE_ADVANCE.)
 
-Sources: klippy/toolhead.py (flush_step_generation, note_step_generation_scan_time,
-_calc_print_time), klippy/extras/input_shaper.py, klippy/kinematics/extruder.py, 2026-08.
+Sources: klippy/toolhead.py (flush_step_generation, _calc_print_time), klippy/extras/
+motion_queuing.py, klippy/extras/input_shaper.py, klippy/kinematics/extruder.py
+(_set_pressure_advance), 2026-08.
 """
 
 from __future__ import annotations
 
 import math
+import re
 
+from stillpath.gcode import _slots as at
 from stillpath.gcode.lexer import Command
 from stillpath.gcode.state import MachineState
 from stillpath.gcode.types import EventKind
@@ -27,15 +32,28 @@ _SMOOTH_S = 0.04
 _MOST_SMOOTH_S = 0.2
 _MOST_REACH_S = 1.0
 _KINDS = tuple(SHAPERS)
+_SET = ("ADVANCE ", "SMOOTH_TIME ")
+_EXTRUDER = re.compile(r"extruder(\d{0,2})")
 
 
 def pressure_advance(state: MachineState, command: Command) -> int:
-    """SET_PRESSURE_ADVANCE: affects only the next flush, not the motion."""
+    """SET_PRESSURE_ADVANCE: stands still where an extruder's smooth time changes."""
     given = state.extended(command)
+    before_s = _ahead_s(state)
+    extruder = int(state.i[at.I_TOOL])
+    if "EXTRUDER" in given:
+        found = _EXTRUDER.fullmatch(given["EXTRUDER"])
+        if found is None:
+            # An [extruder_stepper]'s may change or not.
+            return state.event(EventKind.STOP, 2.0 * before_s)
+        extruder = int(found[1] or 0)
+    smooth_s = _extruder_smooth_s(state, extruder)
     for key in ("ADVANCE", "SMOOTH_TIME"):
         if key in given:
-            state.factors[key] = _number(given[key])
-    return state.event(EventKind.HARMLESS)
+            state.factors[f"{key} {extruder}"] = _number(given[key])
+    if _extruder_smooth_s(state, extruder) == smooth_s:
+        return state.event(EventKind.HARMLESS)
+    return state.event(EventKind.STOP, before_s + _ahead_s(state))
 
 
 def shaper(state: MachineState, command: Command) -> int:
@@ -57,10 +75,18 @@ def shaper(state: MachineState, command: Command) -> int:
 
 def _ahead_s(state: MachineState) -> float:
     """Return how far ahead of the motion steps are made."""
-    advance_s = state.factors.get("ADVANCE", state.machine.pressure_advance_s)
-    smooth_s = state.factors.get("SMOOTH_TIME", _SMOOTH_S) if advance_s > 0.0 else 0.0
-    smooth_s = min(smooth_s, _MOST_SMOOTH_S)
+    # Those without a line of their own are as in printer.cfg, like the one in use.
+    extruders = {int(state.i[at.I_TOOL])}
+    extruders |= {int(key.split()[1]) for key in state.factors if key.startswith(_SET)}
+    smooth_s = max(_extruder_smooth_s(state, extruder) for extruder in extruders)
     return max(_LEAST_S, 0.5 * smooth_s, *(_reach_s(*_shaper(state, axis)) for axis in "XY"))
+
+
+def _extruder_smooth_s(state: MachineState, extruder: int) -> float:
+    """Return the time over which an extruder's speed is averaged; 0: it is not."""
+    advance_s = state.factors.get(f"ADVANCE {extruder}", state.machine.pressure_advance_s)
+    smooth_s = state.factors.get(f"SMOOTH_TIME {extruder}", _SMOOTH_S) if advance_s > 0.0 else 0.0
+    return min(smooth_s, _MOST_SMOOTH_S)
 
 
 def _shaper(state: MachineState, axis: str) -> tuple[str, float, float]:

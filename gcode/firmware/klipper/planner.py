@@ -97,15 +97,23 @@ class Planner(QueuePlanner):
         path = float(np.sqrt(np.sum(step[:3] ** 2)))
         if problem == kernels.E_TOO_LONG:
             return GcodeError(
-                f"the extruder-only move of {step[3]:.3f} mm is longer than the machine's limit "
-                f"of {self._facts[kernels.C_E_LENGTH]:.3f} mm (max_extrude_only_distance)",
+                f"the extruder-only move of {abs(step[3]):.3f} mm is longer than the machine's "
+                f"limit of {self._facts[kernels.C_E_LENGTH]:.3f} mm; split it, or raise "
+                "max_extrude_only_distance in printer.cfg and here",
                 line=line,
             )
         if problem == kernels.E_TOO_THICK:
             return GcodeError(
-                f"the move extrudes {step[3] / path * self._area_mm2:.3f} mm2, more than the "
-                f"machine's limit of {self._facts[kernels.C_E_RATIO] * self._area_mm2:.3f} mm2 "
+                f"the move has an extrusion cross section of {step[3] / path * self._area_mm2:.3f} "
+                "mm2, more than the machine's limit of "
+                f"{self._facts[kernels.C_E_RATIO] * self._area_mm2:.3f} mm2 "
                 "(max_extrude_cross_section); check relative and absolute E",
                 line=line,
             )
-        return GcodeError("speed and acceleration of a move must be above 0", line=line)
+        accel_mm_s2 = float(self._limits[int(moves.limits_id[row]), 1])
+        return GcodeError(
+            f"the move's speed is {moves.speed_mm_s[row]:g} mm/s, its acceleration "
+            f"{accel_mm_s2:g} mm/s2; both must be above 0: correct its F, M220 or "
+            "SET_VELOCITY_LIMIT",
+            line=line,
+        )

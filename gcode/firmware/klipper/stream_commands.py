@@ -90,5 +90,6 @@ class KlipperStreamCommands:
     def in_stream(self, limits: Limits) -> Limits:
         """Mark the file's own limits as being in the middle of a stream."""
         own = cast(KlipperLimits, limits)
-        corner = own.square_corner_velocity_mm_s + IN_STREAM_MARK_MM_S
+        # The mark is the seventh decimal.
+        corner = round(own.square_corner_velocity_mm_s, 6) + IN_STREAM_MARK_MM_S
         return replace(own, square_corner_velocity_mm_s=corner)

@@ -21,7 +21,7 @@ def ignores_shaper_frequencies(version: str) -> bool:
     ----------
     version : str
         What ``git describe`` says of the host, as klippy.log, Moonraker and web pages show it.
-        Copies of Klipper that count otherwise are taken for sound.
+        A fork with another numbering counts as not affected.
     """
     found = _VERSION.match(version)
     return found is not None and int(found[1]) in _IGNORING

@@ -25,7 +25,7 @@ from stillpath.gcode.types import Limits
 from stillpath.models.firmware import Marlin
 from stillpath.models.machine import CommandLimits, Machine
 
-__all__ = ["LONGEST_LEAST_MM", "MarlinAdapter"]
+__all__ = ["LONGEST_LEAST_MM", "STEEPEST_MESH", "MarlinAdapter"]
 
 STEEPEST_MESH = 0.1
 """Z is driven with the stream's acceleration times the slope."""
@@ -56,7 +56,7 @@ class MarlinAdapter:
         self._travel_mm = ((x.min_mm, x.max_mm), (y.min_mm, y.max_mm))
         scale = firmware.steps_per_mm
         self.step_mm = (1.0 / scale.x, 1.0 / scale.y, 1.0 / scale.z, 1.0 / scale.e)
-        self.shortest_move_mm = firmware.min_steps_per_segment * max(self.step_mm[:2])
+        self.shortest_move_mm = firmware.shortest_move_mm
 
     @property
     def refusal(self) -> str | None:
@@ -98,7 +98,7 @@ class MarlinAdapter:
                 "JUNCTION_DEVIATION_MM in that range and say so in planner.junction_deviation_mm, "
                 "or " + _ALTERNATIVE
             )
-        least_mm = firmware.min_steps_per_segment / firmware.steps_per_mm.x
+        least_mm = firmware.shortest_move_mm
         if firmware.min_steps_per_segment > 1 and least_mm > LONGEST_LEAST_MM:
             return (
                 f"it swallows moves below {firmware.min_steps_per_segment} steps "

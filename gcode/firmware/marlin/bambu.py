@@ -12,7 +12,7 @@ from stillpath.gcode.types import EventKind
 
 __all__ = ["BAMBU"]
 
-_CONDITIONAL = commands.unheeded(
+_CONDITIONAL = commands.not_modelled(
     EventKind.UNKNOWN,
     "the printer may skip what follows up to the closing word; its place is not known",
     origin=False,
@@ -28,7 +28,7 @@ BAMBU: dict[str, Word] = {
     # Pressure advance: Marlin waits for standstill when it changes.
     "M900": EventKind.STOP,
     # A factor of all accelerations.
-    "M204.2": commands.unheeded(EventKind.UNKNOWN, "the factor of accelerations is taken as 1"),
+    "M204.2": commands.not_modelled(EventKind.UNKNOWN, "the factor of accelerations is taken as 1"),
     **words("M974 M975", EventKind.SHAPER),
     **words("M624 M625", EventKind.OBJECT),
     # Conditional blocks and changes of filament.

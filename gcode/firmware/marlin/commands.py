@@ -25,13 +25,13 @@ __all__ = [
     "extrude_factor",
     "filament_area",
     "linear_advance",
+    "not_modelled",
     "park_tool",
     "reset_limits",
     "reset_origin",
     "resonance_test",
     "retract_settings",
     "speed_factor",
-    "unheeded",
 ]
 
 _M205 = {
@@ -238,7 +238,7 @@ def resonance_test(state: MachineState, command: Command) -> int:
     return state.event(EventKind.UNKNOWN)
 
 
-def unheeded(kind: EventKind, why: str, *, origin: bool = True) -> Handler:
+def not_modelled(kind: EventKind, why: str, *, origin: bool = True) -> Handler:
     """Return a handler for commands whose effect is not modelled.
 
     Parameters

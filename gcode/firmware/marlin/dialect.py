@@ -74,7 +74,7 @@ RETRACTION: dict[str, Word] = {
     "G11": retract,
     "M207": commands.retract_settings,
     "M208": commands.retract_settings,
-    "M209": commands.unheeded(
+    "M209": commands.not_modelled(
         EventKind.HARMLESS, "moves of the extruder alone may turn into retractions of the firmware"
     ),
 }
@@ -87,7 +87,7 @@ LIMITS: dict[str, Word] = {
     "M900": commands.linear_advance,
 }
 
-_MOVED = commands.unheeded(
+_MOVED = commands.not_modelled(
     EventKind.UNKNOWN, "from here on the position is not known until the printer homes"
 )
 
@@ -103,7 +103,7 @@ STEPS: dict[str, Word] = {
         "M906 M907 M908 M909 M910 M911 M912 M913 M914 M919 M951 M1003 M3426 M7219",
         EventKind.HARMLESS,
     ),
-    # Come to rest, wait, go on from the same place.
+    # Come to rest, wait, go on from the same place. M114 does in some builds only.
     **words(
         "M3 M4 M5 M7 M8 M9 M10 M11 M12 M80 M109 M114 M190 M191 M192 M193 M240 M290 M293 M294 M303 "
         "M400 M872",
@@ -129,15 +129,15 @@ STEPS: dict[str, Word] = {
         _MOVED,
     ),
     **words("M501 M502", commands.reset_limits),
-    "M808": commands.unheeded(
+    "M808": commands.not_modelled(
         EventKind.UNKNOWN, "a part of the file repeats; it is read as if it were there once"
     ),
-    "M92": commands.unheeded(EventKind.HARMLESS, "steps per mm are taken from the machine"),
+    "M92": commands.not_modelled(EventKind.HARMLESS, "steps per mm are taken from the machine"),
     "M593": EventKind.SHAPER,
     # Fixed-time motion has a planner and shapers of its own.
     **words(
         "M493 M494",
-        commands.unheeded(EventKind.UNKNOWN, "fixed-time motion is not modelled"),
+        commands.not_modelled(EventKind.UNKNOWN, "fixed-time motion is not modelled"),
     ),
     "M495": commands.resonance_test,
     "M496": EventKind.HARMLESS,
@@ -148,7 +148,7 @@ def _optional(firmware: Marlin) -> dict[str, Word]:
     """Return the words of the build's options, those that it lacks as barriers."""
     table: dict[str, Word] = {}
     for option, found in OPTIONS.items():
-        lacking = commands.unheeded(
+        lacking = commands.not_modelled(
             EventKind.UNKNOWN,
             f"the build lacks it, as the machine says; if it does not, set {option} in the "
             "machine's firmware section",

@@ -83,8 +83,11 @@ class Planner(QueuePlanner):
         return problem, bad
 
     def _error(self, problem: int, moves: Moves, row: int) -> GcodeError:  # noqa: ARG002
-        line = int(moves.line[row])
-        return GcodeError("the speed of a move must be above 0; give it an F", line=line)
+        return GcodeError(
+            f"the move's speed is {moves.speed_mm_s[row]:g} mm/s; it must be above 0: correct its "
+            "F or M220",
+            line=int(moves.line[row]),
+        )
 
     def _take(self, *, final: bool) -> Phases:
         settled = kernels.settle(self._queue, self._count, self._facts, final)

@@ -42,7 +42,7 @@ PRUSA: dict[str, Word] = {
     ),
     **words(
         "M9140 M9150",
-        commands.unheeded(
+        commands.not_modelled(
             EventKind.UNKNOWN,
             "stealth mode has its own limits; those of the machine are used all the same",
         ),

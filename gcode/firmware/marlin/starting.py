@@ -34,17 +34,17 @@ _BEHIND = 3
 """Number of lines before a late one that may have caused it."""
 
 
-def gentle_accel_mm_s2(bears: CommandLimits, least_hz: float) -> float:
+def gentle_accel_mm_s2(axis_limits: CommandLimits, least_hz: float) -> float:
     """Return the largest acceleration with which a motor can follow a start from rest.
 
     Parameters
     ----------
-    bears : CommandLimits
+    axis_limits : CommandLimits
         Of one axis.
     least_hz : float
         The least step rate.
     """
-    return min(bears.speed_step_mm_s / (1.0 / least_hz + _WITHIN_S), bears.accel_mm_s2)
+    return min(axis_limits.speed_step_mm_s / (1.0 / least_hz + _WITHIN_S), axis_limits.accel_mm_s2)
 
 
 class StreamLevels:
@@ -74,8 +74,8 @@ class StreamLevels:
         ahead: int,
         corexy: bool,
     ) -> None:
-        bears = [command.of(axis) for axis in ("x", "y")]
-        gentle = np.array([gentle_accel_mm_s2(one, least_hz) for one in bears])
+        axis_limits = [command.of(axis) for axis in ("x", "y")]
+        gentle = np.array([gentle_accel_mm_s2(one, least_hz) for one in axis_limits])
         top = np.array([stream.accel_x_mm_s2, stream.accel_y_mm_s2])
         rungs = [gentle * rung for rung in _RUNGS if np.all(gentle * rung < top)]
         self.limits = [
@@ -87,7 +87,7 @@ class StreamLevels:
         way = np.where(self._ours[:, None], np.diff(moves.places_mm(), axis=0)[:, :2], 0.0)
         span_s = np.where(self._ours, np.maximum(moves.planned_s, 1e-6), 1.0)
         motors = way @ np.array([[1.0, 1.0], [1.0, -1.0]]) if corexy else way
-        steps = np.array([one.speed_step_mm_s for one in bears])
+        steps = np.array([one.speed_step_mm_s for one in axis_limits])
         self._speed_mm_s = np.hypot(*way.T) / span_s
         self._feeds = np.diff(moves.places_mm()[:, 3]) > 0.0
         self._fast = np.any(np.abs(motors) / span_s[:, None] > steps, axis=1)

@@ -55,7 +55,7 @@ class MarlinStreamCommands:
         self._advances = firmware.linear_advance is not False
         self._classic_jerk = firmware.junction == "classic_jerk"
         self._least_steps = firmware.min_steps_per_segment
-        self._least_mm = firmware.min_steps_per_segment / firmware.steps_per_mm.x
+        self._least_mm = firmware.shortest_move_mm
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -134,7 +134,8 @@ class MarlinStreamCommands:
 
     def acceleration(self, accel_mm_s2: float) -> bytes:
         """Return the line that sets the acceleration of moves with and without filament."""
-        return f"M204 P{accel_mm_s2:g} T{accel_mm_s2:g}\n".encode()
+        accel = _number(float(f"{accel_mm_s2:g}"))
+        return f"M204 P{accel} T{accel}\n".encode()
 
     def in_stream(self, limits: Limits) -> Limits:
         """Return the limits with linear advance off: a rest's own moves know none.

@@ -16,7 +16,7 @@ from stillpath.gcode.dialect import (
     Word,
     words,
 )
-from stillpath.gcode.firmware.marlin.commands import filament_area, unheeded
+from stillpath.gcode.firmware.marlin.commands import filament_area, not_modelled
 from stillpath.gcode.firmware.reprapfirmware import commands
 from stillpath.gcode.types import EventKind
 from stillpath.gcode.workspaces import machine_space, save_place, select_workspace
@@ -104,13 +104,13 @@ STEPS: dict[str, Word] = {
     **words(
         "G68 G69 G93 G94 M206 M350 M375 M425 M556 M561 M567 M569 M569.1 M569.2 M569.3 M569.4 "
         "M569.5 M569.6 M569.7 M569.8 M569.9 M579 M584 M592 M665 M666 M667 M669 M671 M674 M675",
-        unheeded(
+        not_modelled(
             EventKind.UNKNOWN, "from here on the position is not known until the printer homes"
         ),
     ),
     **words("M501 M502", commands.reset),
     "M563": commands.define_tool,
-    "M92": unheeded(EventKind.STOP, "steps per mm are taken from the machine"),
+    "M92": not_modelled(EventKind.STOP, "steps per mm are taken from the machine"),
     "M593": EventKind.SHAPER,
 }
 

@@ -271,7 +271,10 @@ def test_a_file_with_a_fault_is_not_delivered(
     assert target.read_bytes() == b"kept"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in.gcode", "out.gcode"]
 
-    told = problem_of(pickle.loads(pickle.dumps(caught.value)))
+    caught.value.stream_line = 7
+    again = pickle.loads(pickle.dumps(caught.value))
+    assert again.stream_line == 7
+    told = problem_of(again)
     assert (told["status"], told["title"]) == (500, "The last check failed")
     assert told["detail"] == str(caught.value)
     assert told["line"] == PRINT.count("\n")
