@@ -326,6 +326,32 @@ def test_what_was_interrupted_is_taken_up(bench: Callable[..., Bench], running: 
     assert lost.tries == 2
 
 
+@pytest.mark.parametrize("job_is_known", [True, False])
+def test_a_cancel_outlives_a_restart(
+    bench: Callable[..., Bench], running: Running, job_is_known: bool
+):
+    """It is kept, and ends the job on the server though nobody waits for that yet."""
+    here = bench()
+    entry = here.add("a.gcode", "slow G1 X6\n")
+    until(lambda: entry.job)
+    here.worker.stop(60)
+    job = entry.job
+    if job_is_known:
+        here.book.cancel(entry)
+    else:
+        # Killed between the server's answer and its note: the same request is the same job.
+        here.book.change(entry, job="", is_ours=False)
+    there = bench()
+    (again,) = there.book.open()
+    if not job_is_known:
+        until(lambda: again.job)
+        assert again.job == job
+        there.book.cancel(again)
+    assert there.ended(again).state == "cancelled"
+    if job_is_known:
+        until(lambda: running.client.get(f"/v1/jobs/{job}").json()["state"] == "cancelled")
+
+
 # The program
 
 

@@ -124,7 +124,9 @@ class OnServer(Service):
         Failure
             With the server's reason.
         """
-        if not (self._entry.job and self._is_there(source)):
+        if self._entry.job and not self._is_there(source):
+            self._note(tries=self._entry.tries + 1, job="", is_ours=False)
+        if not self._entry.job:
             self._submit(source, name)
         target = folder / f"result{source.suffix}"
         self._fetch(self._path, self._wait(self._path, None), target)
@@ -177,7 +179,6 @@ class OnServer(Service):
         machine = quote(self._entry.machine, safe="")
         # Whether address, key and machine are right is known before a long upload.
         self._ask("GET", f"/v1/machines/{machine}", self._FIRST_PATIENCE_S)
-        self._note(tries=self._entry.tries + 1, job="", is_ours=False)
         # Sent twice after a lost answer, or by an OctoPrint that was restarted: one job.
         key = f"{self._entry.id}-{self._entry.tries}"
         options = {"machine": self._entry.machine, **self._entry.options, "name": name}

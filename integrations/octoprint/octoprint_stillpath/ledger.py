@@ -50,7 +50,9 @@ class Entry:
     id : str
         Of this entry; no other text may name it in an address.
     tries : int
-        How often it was sent; every time is another request for the server.
+        How many jobs of it were given up; each makes the next one another request for the server.
+    is_cancelled : bool
+        Its end was asked for while it was worked on.
     version : list of int
         Size and time of change of the original when it was taken; empty: not known.
     """
@@ -71,6 +73,7 @@ class Entry:
     result: str = ""
     has_report: bool = False
     tries: int = 0
+    is_cancelled: bool = False
     version: list[int] = field(default_factory=list)
     at: float = field(default_factory=time.time)
     id: str = field(default_factory=lambda: uuid.uuid4().hex)
@@ -99,7 +102,6 @@ class Ledger:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._changed = threading.Condition(threading.RLock())
-        self._cancelled: set[str] = set()
         self.trouble = ""
         self._entries = self._read()
 
@@ -137,8 +139,6 @@ class Ledger:
         with self._changed:
             for name, value in values.items():
                 setattr(entry, name, value)
-            if entry.is_over:
-                self._cancelled.discard(entry.id)
             self._write()
 
     def begin(self, entry: Entry) -> bool:
@@ -154,12 +154,12 @@ class Ledger:
             if entry.state == "waiting":
                 self.change(entry, state="cancelled", stage="", progress=None)
             elif not entry.is_over:
-                self._cancelled.add(entry.id)
+                self.change(entry, is_cancelled=True)
 
     def is_cancelled(self, entry: Entry) -> bool:
         """Return whether its end was asked for."""
         with self._changed:
-            return entry.id in self._cancelled
+            return entry.is_cancelled
 
     def disarm(self, entry: Entry, reason: str) -> None:
         """Do not print the result of an entry."""
