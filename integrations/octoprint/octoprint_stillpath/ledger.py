@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import threading
 import time
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Entry", "Ledger"]
 
+_LOGGER = logging.getLogger("octoprint.plugins.stillpath")
+"""The plugin's, as OctoPrint names it."""
 _KEPT = 20
 
 
@@ -192,11 +195,15 @@ class Ledger:
             ]
         except FileNotFoundError:
             return []
+        except OSError as error:  # of another user's rights, for instance
+            self._tell_trouble(f"{self._path} cannot be read: {error}")
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             aside = self._path.with_suffix(".unreadable")
             self._path.replace(aside)
-            self.trouble = f"{self._path.name} cannot be read ({error}); it is now {aside.name}"
-            return []
+            self._tell_trouble(
+                f"{self._path.name} cannot be read ({error}); it is now {aside.name}"
+            )
+        return []
 
     def _write(self) -> None:
         """Write all entries, whole or not at all."""
@@ -208,4 +215,9 @@ class Ledger:
                 os.fsync(file.fileno())
             part.replace(self._path)
         except OSError as error:
-            self.trouble = f"{self._path.name} cannot be written: {error}"
+            self._tell_trouble(f"{self._path.name} cannot be written: {error}")
+
+    def _tell_trouble(self, text: str) -> None:
+        if text != self.trouble:  # once, and not at every change of an entry
+            _LOGGER.error(text)
+        self.trouble = text
