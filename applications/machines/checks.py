@@ -186,7 +186,7 @@ def machine_from_config(config: PrinterConfig, stated: StatedMachine) -> Machine
             for axis, given in zip("xy", stated.f_hz, strict=True)
         },
     }
-    _refuse_limits_by_axis(config)
+    _check_kinematics(config)
     for fact in facts(config):
         _put(document, fact)
     try:
@@ -197,10 +197,15 @@ def machine_from_config(config: PrinterConfig, stated: StatedMachine) -> Machine
     return machine.model_copy(update={"command": derived_envelope(machine)})
 
 
-def _refuse_limits_by_axis(config: PrinterConfig) -> None:
-    """Refuse a fork's kinematics with fixed limits by axis (Kalico, 2026)."""
+def _check_kinematics(config: PrinterConfig) -> None:
+    """Refuse unknown kinematics, and a fork's with fixed limits by axis (Kalico, 2026)."""
     kinematics = config.text("printer", "kinematics") or ""
     plain = kinematics.removeprefix("limited_")
+    if plain and plain not in ("cartesian", "corexy"):
+        raise ModelError(
+            f"{config.name}: [printer] kinematics {kinematics}: only cartesian and corexy are "
+            "compensated; print on such a machine as sliced"
+        )
     if plain == kinematics:
         return
     names = ("max_accel", "max_x_accel", "max_y_accel")

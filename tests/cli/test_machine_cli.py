@@ -275,7 +275,7 @@ def test_typed_in_resonances(store: MachineStore, config: Path):
         ("max_velocity: 300", "max_velocity: fast", ["line 6", "max_velocity", "fast"]),
         ("max_velocity: 300", "max_velocity: nan", ["line 6", "max_velocity"]),
         ("max_accel = 4000", "", ["[printer] lacks max_accel", "mainsail.cfg", "not followed"]),
-        ("kinematics: corexy", "kinematics: delta", ["kinematics", "delta", "corexy"]),
+        ("kinematics: corexy", "kinematics: delta", ["kinematics delta: only", "as sliced"]),
         ("[stepper_z]", "[stepper_q]", ["travel", "z"]),
         ("position_max: 250", "position_max: -9", ["travel", "-2.0", "-9.0"]),
     ],
