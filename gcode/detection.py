@@ -84,7 +84,8 @@ _SIGNS = (
     _sign(
         "prusa",
         4,
-        rb"^; ?printer_model = (?:MINI|MK4S?|MK3\.[59]S?|XL|COREONE|HT90|iX)",
+        rb"^; ?printer_model = (?:MINI(?:IS)?|MK4(?:S|IS)?|MK3\.[59]S?|XL\d?(?:IS)?|COREONEL?"
+        rb"|HT90|iX)(?:MMU\d)?[ \t\r]*$",
         "printer_model is one with Prusa's Buddy firmware",
     ),
     _sign(

@@ -54,7 +54,7 @@ def load_machine(name_or_path: str | Path) -> Machine:
 
 def names_a_file(text: str) -> bool:
     """Return whether `text` is the path of a file rather than a machine's name."""
-    return text.endswith(".json") or "/" in text or "\\" in text
+    return text.lower().endswith(".json") or "/" in text or "\\" in text
 
 
 def no_such_machine(name: str, own: Sequence[str] = (), *, files: bool = True) -> ModelError:

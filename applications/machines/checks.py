@@ -36,7 +36,8 @@ _ACCEL_ROOM, _SPEED_ROOM, _CORNERS = 1.5, 1.2, 6.0
 """Limits assumed for motors where none are stated: these multiples of the acceleration, speed and
 corner speed that the printer allows a file."""
 _LEAST_STEP_MM_S = 20.0
-_NOT_MORE = 1.001
+_ROUNDING = 1.001
+"""Ratio up to which two limits count as equal."""
 _RELATIVE = 1e-6
 
 
@@ -185,7 +186,7 @@ def machine_from_config(config: PrinterConfig, stated: StatedMachine) -> Machine
             for axis, given in zip("xy", stated.f_hz, strict=True)
         },
     }
-    _refuse_limits_by_axis(config)
+    _check_kinematics(config)
     for fact in facts(config):
         _put(document, fact)
     try:
@@ -196,10 +197,15 @@ def machine_from_config(config: PrinterConfig, stated: StatedMachine) -> Machine
     return machine.model_copy(update={"command": derived_envelope(machine)})
 
 
-def _refuse_limits_by_axis(config: PrinterConfig) -> None:
-    """Refuse a fork's kinematics with fixed limits by axis (Kalico, 2026)."""
+def _check_kinematics(config: PrinterConfig) -> None:
+    """Refuse unknown kinematics, and a fork's with fixed limits by axis (Kalico, 2026)."""
     kinematics = config.text("printer", "kinematics") or ""
     plain = kinematics.removeprefix("limited_")
+    if plain and plain not in ("cartesian", "corexy"):
+        raise ModelError(
+            f"{config.name}: [printer] kinematics {kinematics}: only cartesian and corexy are "
+            "compensated; print on such a machine as sliced"
+        )
     if plain == kinematics:
         return
     names = ("max_accel", "max_x_accel", "max_y_accel")
@@ -285,18 +291,18 @@ def envelope_warnings(machine: Machine) -> list[str]:
     found: dict[str, tuple[float, float]] = {}
     for axis in ("x", "y"):
         most, asked = derived.of(axis).accel_mm_s2, stated.of(axis).accel_mm_s2
-        if asked > _NOT_MORE * most:
+        if asked > _ROUNDING * most:
             by_axis = axis in stated.axes and stated.axes[axis].accel_mm_s2 is not None
             place = f"axes.{axis}.accel_mm_s2" if by_axis else "accel_mm_s2"
             found[place] = (asked, min(most, found.get(place, (asked, most))[1]))
     motors = [limits.motors and limits.motors.accel_mm_s2 for limits in (stated, derived)]
-    if motors[0] and motors[1] and motors[0] > _NOT_MORE * motors[1]:
+    if motors[0] and motors[1] and motors[0] > _ROUNDING * motors[1]:
         found["motors.accel_mm_s2"] = (motors[0], motors[1])
     return [
         f"{machine.name}: a command may ask the motors for {asked:.0f} mm/s2 (command.{place}), "
         f"more than {_ACCEL_ROOM:g} times what the printer allows a file "
-        f"({most / _ACCEL_ROOM:.0f}): right if the motors were tried at it; otherwise put "
-        f"{most:.0f} there"
+        f"({most / _ACCEL_ROOM:.0f}): right if the motors were tested at that "
+        f"acceleration; otherwise put {most:.0f} there"
         for place, (asked, most) in found.items()
     ]
 

@@ -26,7 +26,7 @@ __all__ = [
 ]
 
 _LARGEST_BYTES = 4_000_000
-_SAVED = "#*# "
+_SAVED_PREFIX = "#*# "
 _SECTION = re.compile(r"\[(?P<name>[^]]+)\]\s*$")
 _OPTION = re.compile(r"(?P<name>[^\s:=][^:=]*)[:=]\s*(?P<value>.*)$")
 _COMMENT = re.compile(r"#.*$|(?:^|\s);.*$")
@@ -121,7 +121,7 @@ def read_printer_config(path: Path) -> PrinterConfig:
 
 def parse_printer_config(text: str, name: str) -> PrinterConfig:
     """Return what `read_printer_config` does, of the text of a file called `name`."""
-    lines = text.splitlines()
+    lines = text.removeprefix("\ufeff").splitlines()
     own, includes = _parse(lines, saved=False)
     saved, _ = _parse(lines, saved=True)
     if not own:
@@ -148,15 +148,21 @@ def _parse(
     sections: _Sections = {}
     includes: list[str] = []
     current: dict[str, Option] = {}
+    begun = ""
     begun_at: int | None = None  # indentation of the option that deeper lines go on with
     for number, full in enumerate(lines, 1):
         if full.startswith("#*#") is not saved:
             continue
-        indented = _COMMENT.sub("", full[len(_SAVED) :] if saved else full).rstrip()
+        indented = _COMMENT.sub("", full[len(_SAVED_PREFIX) :] if saved else full).rstrip()
         line = indented.lstrip()
         indent = len(indented) - len(line)
-        if not line or (begun_at is not None and indent > begun_at):
-            continue  # continuation lines of macros and lists do not concern motion
+        if not line:
+            continue
+        if begun_at is not None and indent > begun_at:
+            # Numbers have one line, which may be the next; more of macros and lists is not needed.
+            if not current[begun].value:
+                current[begun] = Option(line, number)
+            continue
         begun_at = None
         if section := _SECTION.match(line):
             name = section["name"].strip()
@@ -165,7 +171,8 @@ def _parse(
             else:
                 current = sections.setdefault(name.lower(), {})
         elif option := _OPTION.match(line):
-            current[option["name"].strip().lower()] = Option(option["value"], number)
+            begun = option["name"].strip().lower()
+            current[begun] = Option(option["value"], number)
             begun_at = indent
     return sections, tuple(includes)
 

@@ -227,7 +227,7 @@ def _set_fields(section: dict[str, Any], fields: Sequence[str]) -> None:
 
 
 def _commands(text: str) -> dict[str, _Words]:
-    """Return each command's words; M593 stands under ``M593 X`` and ``M593 Y``."""
+    """Return each command's words; M593 stands under ``M593 X``, ``M593 Y``, ..."""
     found: dict[str, _Words] = {}
     for line in text.splitlines():
         if len(line) > _LONGEST_LINE or (match := _COMMAND.search(line)) is None:
@@ -242,7 +242,8 @@ def _commands(text: str) -> dict[str, _Words]:
             continue
         names = [command]
         if command == "M593":
-            names = [f"M593 {axis}" for axis in "XY" if axis in words] or ["M593 X", "M593 Y"]
+            # Without an axis it counts for all.
+            names = [f"M593 {axis}" for axis in "XYZ" if axis in words] or ["M593 X", "M593 Y"]
         for name in names:
             found.setdefault(name, {}).update(words)
     return found

@@ -33,7 +33,9 @@ _DIRECTIONS = (
     (math.sqrt(0.5), -math.sqrt(0.5)),
 )
 _LEVEL = re.compile(r"^; level (\d+): accel ([\d.]+) mm/s2, step ([\d.]+) mm/s$", re.MULTILINE)
-_COUNTED = re.compile(r"mcu: stepper_x:(-?\d+) stepper_y:(-?\d+)")
+_ANSWER = re.compile(r"mcu: (stepper_.*)")
+_COUNTED = re.compile(r"stepper_([xy]\d*):(-?\d+)")
+"""A stepper and its counter; an axis may have several."""
 
 
 @dataclass(frozen=True)
@@ -110,17 +112,24 @@ def borne(levels: list[Level], console: str, full_step: int) -> int:
     Raises
     ------
     ModelError
-        The text holds fewer answers than the search asks for.
+        The text holds fewer answers than the search asks for, or answers of several printers.
     """
-    counts = [(int(x), int(y)) for x, y in _COUNTED.findall(console)]
+    counts = [dict(_COUNTED.findall(answer)) for answer in _ANSWER.findall(console)]
     if len(counts) <= len(levels):
         raise ModelError(
             f"the console holds {len(counts)} answers to GET_POSITION, the search asks for "
             f"{len(levels) + 1}: run the whole file, then hand in the console's text or klippy.log"
         )
     first, *later = counts[-len(levels) - 1 :]
-    lost = [max(abs(a - b) for a, b in zip(first, one, strict=True)) >= full_step for one in later]
-    return lost.index(True) if True in lost else len(levels)
+    for passed, one in enumerate(later):
+        if one.keys() != first.keys():
+            raise ModelError(
+                f"answer {passed + 2} to GET_POSITION lists other steppers of X and Y than the "
+                f"first ({', '.join(one)}; {', '.join(first)}): hand in the text of one run alone"
+            )
+        if any(abs(int(one[name]) - int(at)) >= full_step for name, at in first.items()):
+            return passed
+    return len(levels)
 
 
 def envelope(machine: Machine, level: Level, margin: float) -> CommandLimits:

@@ -48,6 +48,10 @@ class BlockType(IntEnum):
     THUMBNAIL = 5
 
 
+_TIMED = (BlockType.PRINT_METADATA, BlockType.PRINTER_METADATA)
+"""Both hold the slicer's time; printers show that of `PRINTER_METADATA`."""
+
+
 class Encoding(IntEnum):
     """Numbers of the format, for G-code blocks."""
 
@@ -198,13 +202,13 @@ class BinaryGcode:
     def _renewed(self, block: Block) -> bytes:
         """Return the bytes of a block, with the print's new time."""
         content = self._content(block)
-        if block.type is not BlockType.PRINT_METADATA or content == block.content():
+        if block.type not in _TIMED or content == block.content():
             return block.raw
         return self._block(block.type, Compression(block.compression), block.parameters, content)
 
     def _content(self, block: Block) -> bytes:
         content = block.content()
-        timed = block.type is BlockType.PRINT_METADATA and self.delay_s != 0.0
+        timed = block.type in _TIMED and self.delay_s != 0.0
         return retimed(content, self.delay_s) if timed else content
 
     def _head(self, *, thumbnails: bool = True) -> bytes:

@@ -33,8 +33,8 @@ _IDENTITIES = tuple(
         rb"^;Generated with (?P<name>Cura_SteamEngine) (?P<version>\S+)",
         rb"^;Sliced by (?P<name>ideaMaker) (?P<version>[\d.]+)",
         rb"^; (?P<name>KISSlicer)\b[^\n]*\n(?:;[^\n]*\n)?; version (?P<version>[^\r\n]+)",
-        rb"^; ?[Gg]enerated by (?P<name>[^\r\n]{1,60}?) (?P<version>v?\d\S*)",
-        rb"^; (?P<name>BambuStudio|OrcaSlicer|Creality_Print) (?P<version>v?\d\S*)",
+        rb"^; ?[Gg]enerated by (?P<name>[^\r\n]{1,60}?) (?P<version>[vV]?\d\S*)",
+        rb"^; (?P<name>BambuStudio|OrcaSlicer|Creality_Print) (?P<version>[vV]?\d\S*)",
     )
 )
 _BLOCKS = (
@@ -48,7 +48,7 @@ _SETTING = re.compile(rb"^; ([a-z][a-z0-9_]*) = ?([^\r\n]*)", re.MULTILINE)
 _CURA_SETTING = re.compile(rb"^;SETTING_3 ([^\r\n]*)", re.MULTILINE)
 _GAP = re.compile(r"[^\S\n]{2,}")
 _TIME_LINE = re.compile(rb"^;?[^\n]{0,60}?[Tt](?:IME|ime)[^\n]{0,100}$", re.MULTILINE)
-_LATEST_WORD = 64
+_KEYWORD_WITHIN_BYTES = 64
 _FLAVOR = re.compile(rb"^;FLAVOR:([^\r\n]+)", re.MULTILINE)
 _PRODUCTS = {"Cura_SteamEngine": "Cura", "Slic3r Prusa Edition": "PrusaSlicer"}
 
@@ -175,8 +175,8 @@ def _time_lines(text: bytes) -> Iterator[re.Match[bytes]]:
         at = text.find(word)
         while at >= 0:
             # Further on in a line the word is too late.
-            first = text.rfind(b"\n", max(at - _LATEST_WORD, 0), at) + 1
-            if first > 0 or at < _LATEST_WORD:
+            first = text.rfind(b"\n", max(at - _KEYWORD_WITHIN_BYTES, 0), at) + 1
+            if first > 0 or at < _KEYWORD_WITHIN_BYTES:
                 starts.add(first)
             at = text.find(word, at + len(word))
     for start in sorted(starts):

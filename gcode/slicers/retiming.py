@@ -129,7 +129,7 @@ class Retiming:
         at = 0
         for row in _candidates(item):
             line = item.line(item.events, row)
-            kind = _what_it_tells(line)
+            kind = _line_kind(line)
             if kind is None:
                 continue
             found = _find_line(text, line, at)
@@ -228,7 +228,7 @@ def _total(told_s: Mapping[tuple[TimeKind, bool], float], *, silent: bool) -> fl
 
 
 @lru_cache(maxsize=256)
-def _what_it_tells(line: bytes) -> Literal["time", "stop"] | None:
+def _line_kind(line: bytes) -> Literal["time", "stop"] | None:
     """Return whether a line states times or marks a stop; cached, as slicers repeat lines."""
     if may_tell_time(line) and read_times(line):
         return "time"

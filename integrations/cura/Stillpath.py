@@ -331,7 +331,12 @@ def _command(text: str) -> list[str]:
     """Return the words of a command; a path with spaces needs no quotes if nothing follows it."""
     if Path(text).is_file() or shutil.which(text):
         return [text]
-    return [word.strip("\"'") for word in shlex.split(text, posix=os.name == "posix")]
+    try:
+        words = shlex.split(text, posix=os.name == "posix")
+    except ValueError:
+        raise Failure(f"the setting Program is {text!r}: a quote is not closed") from None
+    words = [word.strip("\"'") for word in words]
+    return [str(Path(word).expanduser()) if word.startswith("~/") else word for word in words]
 
 
 def _environment(name: str) -> dict[str, str]:

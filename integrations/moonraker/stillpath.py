@@ -260,7 +260,8 @@ class Stillpath:
                 await self._compensate(job)
                 # A cancel that came when all was done comes too late.
                 self._change(job, "done", progress=1.0)
-                await self._after(job)
+                if not job.get("again"):
+                    await self._after(job)
             except (Refused, OSError) as error:
                 if job["state"] != "cancelled":
                     self._change(job, "failed", reason=str(error))
@@ -270,7 +271,7 @@ class Stillpath:
                 # A worker that ended would never do anything again, and say nothing.
                 reason = f"a bug of Stillpath: {type(error).__name__}: {error}"
                 self._change(job, "failed", reason=reason)
-            if job.get("again") and job["state"] == "failed":
+            if job.get("again") and job["state"] in ("failed", "done"):
                 with contextlib.suppress(Refused):  # gone
                     self._enqueue(job["file"], job["print_after"], force=True)
 
@@ -286,15 +287,10 @@ class Stillpath:
             await self._run(job, copy)
             if not await loop.run_in_executor(None, _is_stamped, copy):
                 raise Refused("what came back is not marked as compensated; it was not kept")
-            if _state_of(source) != self._taken:
-                raise Refused(
-                    "it was changed, moved or deleted while it was processed; the result was not "
-                    "kept"
-                )
             await self._check_free(job["result"], result)
             if job["state"] == "cancelled":
                 raise Refused("cancelled")
-            await loop.run_in_executor(None, _placed, copy, result, self._taken[1])
+            await loop.run_in_executor(None, _placed, copy, result, source, self._taken)
         finally:
             await loop.run_in_executor(None, lambda: shutil.rmtree(work, ignore_errors=True))
 
@@ -485,7 +481,7 @@ def _is_stamped(file: Path) -> bool:
     return re.search(IDENT, head, re.MULTILINE) is not None
 
 
-def _placed(made: Path, result: Path, time_ns: int) -> None:
+def _placed(made: Path, result: Path, source: Path, taken: tuple[int, int]) -> None:
     """Put a file in its place, whole or not at all; Moonraker sees it by its last name only.
 
     Its time becomes that of the original. So it tells what it was made of, also where files are
@@ -496,7 +492,12 @@ def _placed(made: Path, result: Path, time_ns: int) -> None:
         shutil.copyfile(made, part)
         with part.open("rb+") as file:
             os.fsync(file.fileno())
-        os.utime(part, ns=(time_ns, time_ns))
+        os.utime(part, ns=(taken[1], taken[1]))
+        # At the last moment: copying to a slow card takes its time.
+        if _state_of(source) != taken:
+            raise Refused(
+                "it was changed, moved or deleted while it was processed; the result was not kept"
+            )
         part.replace(result)
     except BaseException:
         with contextlib.suppress(OSError):

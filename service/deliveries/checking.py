@@ -9,6 +9,7 @@ noticed that the document cannot tell: another pulley, another motor current.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
 from typing import Any, Literal
@@ -57,6 +58,7 @@ _STEPPER = frozenset(
         "position_max",
     }
 )
+_DRIVER_OF_XY = re.compile(r"tmc\S+ stepper_[xy](?P<further>\d*)")
 _DRIVER = frozenset({"run_current", "interpolate", "stealthchop_threshold"})
 _EXTRUDER = _STEPPER | {
     "nozzle_diameter",
@@ -278,7 +280,7 @@ def relevant(asked: PrinterState) -> dict[str, dict[str, Any]]:
             kept = set(options)
         elif words[0].startswith("stepper_"):
             kept = set(_STEPPER)
-        elif words[0].startswith("tmc") and words[-1] in ("stepper_x", "stepper_y"):
+        elif _DRIVER_OF_XY.fullmatch(section):
             kept = set(_DRIVER)
         elif words[0] == "extruder":
             kept = set(_EXTRUDER)
@@ -429,6 +431,9 @@ def _changes(known: _Remembered, asked: PrinterState) -> Iterator[Finding]:
     now = relevant(asked)
     day = known.when.astimezone().strftime("%Y-%m-%d")
     for section in sorted({*known.sections, *now}):
+        driver = _DRIVER_OF_XY.fullmatch(section)
+        if driver and driver["further"] and section not in known.sections:
+            continue  # until 2026-11-28 drivers of second motors were not remembered
         before, after = known.sections.get(section, {}), now.get(section, {})
         for option in sorted({*before, *after}):
             was, is_now = before.get(option), after.get(option)

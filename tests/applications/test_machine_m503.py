@@ -32,6 +32,7 @@ Recv: echo:  M208 S0.10 W0.00 F480.00
 Recv: echo:; Input Shaping:
 Recv: echo:  M593 X F40.50 D0.15
 Recv: echo:  M593 Y F31.00 D0.10
+Recv: echo:  M593 Z F21.00 D0.20
 Recv: echo:; Linear Advance:
 Recv: echo:  M900 T0 K0.05
 Recv: echo:  M900 T1 K0.80

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 
@@ -17,6 +18,14 @@ from tests.gcode.plain_reader import read
 
 def console(*counts: tuple[int, int]) -> str:
     return "\n".join(f"// mcu: stepper_x:{x} stepper_y:{y} stepper_z:0" for x, y in counts)
+
+
+def console_of_four_motors(*counts: tuple[int, int]) -> str:
+    """Return what Klipper says where each axis has a second motor, and those move as counted."""
+    return "\n".join(
+        f"// mcu: stepper_x:0 stepper_x1:{x} stepper_y:0 stepper_y1:{y} stepper_z:0"
+        for x, y in counts
+    )
 
 
 @pytest.mark.parametrize("name", ["ender3", "voron-v24-250"])
@@ -38,7 +47,8 @@ def test_what_is_written(name: str) -> None:
     assert "ACCEL=5000 " in text.split("SET_VELOCITY_LIMIT")[-1]
 
 
-def test_what_the_console_says() -> None:
+@pytest.mark.parametrize("console", [console, console_of_four_motors])
+def test_what_the_console_says(console: Callable[..., str]) -> None:
     levels = levels_of(motor_test(load_machine("ender3"), 9000.0))
     fine = [(100, -200), (103, -198), (96, -205), (100, -215)]
     assert len(levels) == 4
@@ -49,6 +59,13 @@ def test_what_the_console_says() -> None:
         borne(levels, console(*fine), 16)
     with pytest.raises(ModelError, match="has no levels"):
         levels_of("G28")
+
+
+def test_answers_of_two_printers_are_refused() -> None:
+    levels = levels_of(motor_test(load_machine("ender3"), 9000.0))
+    mixed = f"{console(*4 * [(0, 0)])}\n{console_of_four_motors((0, 0))}"
+    with pytest.raises(ModelError, match="answer 5 to GET_POSITION lists other steppers"):
+        borne(levels, mixed, 16)
 
 
 def test_other_firmwares_and_limits_that_are_not_above() -> None:

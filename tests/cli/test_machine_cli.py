@@ -196,18 +196,20 @@ def test_bad_settings_are_refused(monkeypatch: pytest.MonkeyPatch, capsys):
 # Klipper's configuration
 
 
-def test_indentation_counts_as_in_configparser(tmp_path: Path):
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])
+def test_indentation_counts_as_in_configparser(tmp_path: Path, encoding: str):
     file = tmp_path / "printer.cfg"
     file.write_text(
-        "[printer]\n  max_velocity: 300\n\n  max_accel: 4000\n[gcode_macro A]\ngcode:\n\n"
-        "  [printer]\n  max_accel: 1\n[extruder]\n\tnozzle_diameter: 0.6\n"
+        "[printer]\n  max_velocity:\n    300 # fast\n\n  max_accel: 4000\n[gcode_macro A]\n"
+        "gcode:\n\n  [printer]\n  max_accel: 1\n[extruder]\n\tnozzle_diameter: 0.6\n",
+        encoding=encoding,
     )
     found = read_printer_config(file)
     theirs = configparser.RawConfigParser(strict=False, inline_comment_prefixes=(";", "#"))
-    theirs.read(file)
+    theirs.read(file, encoding)
     for section in ("printer", "extruder"):
         options = {name: option.value for name, option in found.sections[section].items()}
-        assert options == dict(theirs[section])
+        assert options == {name: value.strip() for name, value in theirs[section].items()}
 
 
 def test_a_machine_from_a_printer_cfg(store: MachineStore, config: Path, capsys):
@@ -281,7 +283,7 @@ def test_typed_in_resonances(store: MachineStore, config: Path):
         ("max_velocity: 300", "max_velocity: fast", ["line 6", "max_velocity", "fast"]),
         ("max_velocity: 300", "max_velocity: nan", ["line 6", "max_velocity"]),
         ("max_accel = 4000", "", ["[printer] lacks max_accel", "mainsail.cfg", "not followed"]),
-        ("kinematics: corexy", "kinematics: delta", ["kinematics", "delta", "corexy"]),
+        ("kinematics: corexy", "kinematics: delta", ["kinematics delta: only", "as sliced"]),
         ("[stepper_z]", "[stepper_q]", ["travel", "z"]),
         ("position_max: 250", "position_max: -9", ["travel", "-2.0", "-9.0"]),
     ],

@@ -89,6 +89,21 @@ def test_plain_text_has_the_metadata_as_comments(tmp_path: Path):
     ]
 
 
+def test_the_new_time_stands_wherever_a_printer_looks(tmp_path: Path):
+    """PrusaSlicer writes it twice, and printers read the metadata of the printer."""
+
+    def metadata(time: bytes) -> bytes:
+        told = b"estimated printing time (normal mode)=%s\n" % time
+        return binary([])[:10] + block(3, b"printer_model=MK4\n" + told) + block(4, told)
+
+    source, target = tmp_path / "part.bgcode", tmp_path / "new.bgcode"
+    source.write_bytes(metadata(b"1m 8s") + block(1, TEXT))
+    with open_text(source) as container, rewriting(container, target, name=target) as made:
+        container.delay(60.0)
+        made.write(b"G28\n")
+    assert target.read_bytes() == metadata(b"2m 8s") + block(1, b"G28\n")
+
+
 def test_a_damaged_block_is_named(tmp_path: Path):
     good = binary([TEXT, TEXT])
     offset = 10

@@ -96,6 +96,8 @@ def test_failures_are_seen_and_the_layers_stay(cura: Cura, script: Any):
         ({"where": "server", "method": "magic"}, ("method", "magic")),
         ({"where": "command", "command": "/gone/stillpath-post"}, ("/gone/", "cannot be run")),
         ({"where": "command", "command": "false"}, ("does not say why", "exit code 1")),
+        ({"where": "command", "command": "~/gone/x"}, (f"{Path.home()}/gone/x", "cannot be run")),
+        ({"where": "command", "command": "'/gone/x"}, ("a quote is not closed",)),
         ({"where": "command", "command": ""}, ("cannot be run",)),
     ],
 )

@@ -256,6 +256,30 @@ def test_what_is_uploaded_again_meanwhile_is_done_again(tmp_path: Path):
     assert (server.gcodes / "a.sp.gcode").read_text().endswith("1\nG28\n")
 
 
+@pytest.mark.parametrize("late", ["_check_free", "_change"])
+def test_an_upload_at_the_last_moment_is_done_again(tmp_path: Path, late: str):
+    """While the result is put in its place, and right behind that; nothing older is printed."""
+
+    async def scenario(server: Server, component: Any) -> None:
+        given, own, calls = stamping(component), getattr(component, late), []
+
+        def upload_then(*words: Any, **more: Any) -> Any:
+            calls.append(words)
+            if (len(given) == 1 and words[-1] == "done") or (
+                late == "_check_free" and len(calls) == 2
+            ):
+                server.upload("a.gcode", "G28\n")
+            return own(*words, **more)
+
+        setattr(component, late, upload_then)
+        server.upload("a.gcode", PART)
+        await server.until(lambda: len(given) == 2 and server.started)
+        assert (server.gcodes / "a.sp.gcode").read_text().endswith("1\nG28\n")
+
+    server = with_component(tmp_path, scenario, print_after="True")
+    assert server.started == ["a.sp.gcode"]
+
+
 def stamping(component: Any) -> list[str]:
     """Let a component compensate without a server; return what it was given, as it comes."""
     given: list[str] = []

@@ -163,11 +163,18 @@ def test_a_list_that_cannot_be_read_is_put_aside(tmp_path: Path, text: str):
     assert (tmp_path / "files.unreadable").exists()
 
 
-def test_a_list_that_cannot_be_written_stays_in_memory(tmp_path: Path):
+def test_a_list_that_cannot_be_written_stays_in_memory(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
+    (tmp_path / "a folder").mkdir()
+    assert "cannot be read" in ledger.Ledger(tmp_path / "a folder").trouble
+    caplog.clear()
     book = ledger.Ledger(tmp_path / "no such folder" / "files.json")
     book.add(ledger.Entry("a.gcode", "m", {}))
-    assert len(book.entries()) == 1
+    book.add(ledger.Entry("b.gcode", "m", {}))
+    assert len(book.entries()) == 2
     assert "cannot be written" in book.trouble
+    assert caplog.messages == [book.trouble]
 
 
 # The worker, with a real server
@@ -334,6 +341,32 @@ def test_what_was_interrupted_is_taken_up(bench: Callable[..., Bench], running: 
     assert lost.tries == 2
 
 
+@pytest.mark.parametrize("job_is_known", [True, False])
+def test_a_cancel_outlives_a_restart(
+    bench: Callable[..., Bench], running: Running, job_is_known: bool
+):
+    """It is kept, and ends the job on the server though nobody waits for that yet."""
+    here = bench()
+    entry = here.add("a.gcode", "slow G1 X6\n")
+    until(lambda: entry.job)
+    here.worker.stop(60)
+    job = entry.job
+    if job_is_known:
+        here.book.cancel(entry)
+    else:
+        # Killed between the server's answer and its note: the same request is the same job.
+        here.book.change(entry, job="", is_ours=False)
+    there = bench()
+    (again,) = there.book.open()
+    if not job_is_known:
+        until(lambda: again.job)
+        assert (again.job, again.tries) == (job, entry.tries)
+        there.book.cancel(again)
+    assert there.ended(again).state == "cancelled"
+    if job_is_known:
+        until(lambda: running.client.get(f"/v1/jobs/{job}").json()["state"] == "cancelled")
+
+
 # The program
 
 
@@ -393,8 +426,14 @@ def test_a_program_ends_with_its_job(bench: Callable[..., Bench], tmp_path: Path
     here.book.cancel(entry)
     assert here.ended(entry).state == "cancelled"
     assert not Path(f"/proc/{pid.read_text()}").exists()
-    here = bench(command="/gone/stillpath")
-    assert "/gone/stillpath cannot be run" in here.ended(here.add("a.gcode", "G1\n")).message
+    for command, words in (
+        ("/gone/stillpath", "/gone/stillpath cannot be run"),
+        ("~/gone/stillpath", f"{Path.home()}/gone/stillpath cannot be run"),
+        ("'/gone/stillpath", "a quote is not closed"),
+    ):
+        here = bench(command=command)
+        assert words in here.ended(here.add("a.gcode", "G1\n")).message
+        here.worker.stop(60)
 
 
 def test_a_long_upload_that_breaks_off_is_sent_again(tmp_path: Path):

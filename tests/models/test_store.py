@@ -86,6 +86,8 @@ def test_unknown_names_and_files(tmp_path: Path) -> None:
         load_machine("zzz")
     with pytest.raises(ModelError, match="cannot read the machine file"):
         load_machine(tmp_path / "none.json")
+    with pytest.raises(ModelError, match="cannot read the machine file"):
+        load_machine("none.JSON")
     (tmp_path / "bad.json").write_bytes(b"\xff{")
     with pytest.raises(ModelError, match="not JSON"):
         load_machine(tmp_path / "bad.json")

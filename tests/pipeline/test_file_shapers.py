@@ -112,6 +112,7 @@ def test_a_machine_that_states_no_shaper_and_a_file_that_sets_one(tmp_path: Path
         ("klipper", "SET_INPUT_SHAPER SHAPER_TYPE=ei", ""),
         ("klipper", SETS["klipper"], None),
         ("marlin", "M593 X F42", " of Y"),
+        ("marlin", "M593 Z F42", ""),
     ],
 )
 def test_an_axis_whose_shaper_nobody_states_is_told(

@@ -87,9 +87,10 @@ class MarlinStreamCommands:
         ).encode()
 
     def shaped_axes(self, line: bytes) -> str:
-        """Return the axes of an M593 with F: those that it names, or both."""
+        """Return those of X and Y that an M593 with F names, or both if it names none."""
         code = line.split(b";", 1)[0].upper().decode("latin-1")
-        return ("".join(axis for axis in "XY" if axis in code) or "XY") if "F" in code else ""
+        named = "".join(axis for axis in "XYZ" if axis in code) or "XY"
+        return named.replace("Z", "") if "F" in code else ""
 
     def advance(self, limits: Limits) -> bytes:  # noqa: ARG002
         """Return nothing: it comes with the limits."""

@@ -59,8 +59,6 @@ class StillpathPlugin(
         self._ledger = Ledger(folder / "files.json")
         self._reports = Reports(folder / "reports")
         self._host = OctoPrintHost(self, self._ledger, self._reports, self._show)
-        if self._ledger.trouble:
-            self._logger.error(self._ledger.trouble)
         for entry in self._ledger.open():
             self._logger.info("%s is taken up again", entry.path)
             self._ledger.disarm(entry, "OctoPrint was restarted meanwhile")

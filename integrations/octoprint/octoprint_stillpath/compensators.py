@@ -125,7 +125,9 @@ class OnServer(Service):
         Failure
             With the server's reason.
         """
-        if not (self._entry.job and self._is_there(source)):
+        if self._entry.job and not self._is_there(source):
+            self._note(tries=self._entry.tries + 1, job="", is_ours=False)
+        if not self._entry.job:
             self._submit(source, name)
         target = folder / f"result{source.suffix}"
         self._fetch(self._path, self._wait(self._path, None), target)
@@ -180,7 +182,6 @@ class OnServer(Service):
         machine = quote(self._entry.machine, safe="")
         # Whether address, key and machine are right is known before a long upload.
         self._ask("GET", f"/v1/machines/{machine}", self._FIRST_PATIENCE_S)
-        self._note(tries=self._entry.tries + 1, job="", is_ours=False)
         # Sent twice after a lost answer, or by an OctoPrint that was restarted: one job.
         key = f"{self._entry.id}-{self._entry.tries}"
         options = {"machine": self._entry.machine, **self._entry.options, "name": name}
@@ -298,7 +299,12 @@ def _words(text: str) -> list[str]:
     """Return the words of a command; a path with spaces needs no quotes if nothing follows it."""
     if Path(text).is_file() or shutil.which(text):
         return [text]
-    return [word.strip("\"'") for word in shlex.split(text, posix=os.name == "posix")]
+    try:
+        words = shlex.split(text, posix=os.name == "posix")
+    except ValueError:
+        raise Failure(f"the setting Program is {text!r}: a quote is not closed") from None
+    words = [word.strip("\"'") for word in words]
+    return [str(Path(word).expanduser()) if word.startswith("~/") else word for word in words]
 
 
 def _positive(value: Any) -> float | None:

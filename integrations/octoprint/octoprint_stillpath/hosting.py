@@ -72,7 +72,11 @@ class OctoPrintHost(Host):
         tell: Callable[[str, float | None], object],
         note: Callable[..., object],
     ) -> OnServer | ByCommand:
-        """Return a server or the program, as it was set when the file came."""
+        """Return a server or the program, as `where` was set when the file came.
+
+        A file is processed with the machine, method and server that were set when it was uploaded;
+        key, patience and program are read when its work begins.
+        """
         get = self._settings.get
         if entry.where == "command":
             return ByCommand(entry, str(get(["command"]) or "").strip(), tell)

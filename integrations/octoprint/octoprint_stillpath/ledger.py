@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import threading
 import time
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Entry", "Ledger"]
 
+_LOGGER = logging.getLogger("octoprint.plugins.stillpath")
+"""The plugin's, as OctoPrint names it."""
 _KEPT = 20
 
 
@@ -50,7 +53,9 @@ class Entry:
     id : str
         Of this entry; no other text may name it in an address.
     tries : int
-        How often it was sent; every time is another request for the server.
+        How many jobs of it were given up; each makes the next one another request for the server.
+    is_cancelled : bool
+        Its end was asked for while it was worked on.
     version : list of int
         Size and time of change of the original when it was taken; empty: not known.
     """
@@ -71,6 +76,7 @@ class Entry:
     result: str = ""
     has_report: bool = False
     tries: int = 0
+    is_cancelled: bool = False
     version: list[int] = field(default_factory=list)
     at: float = field(default_factory=time.time)
     id: str = field(default_factory=lambda: uuid.uuid4().hex)
@@ -99,7 +105,6 @@ class Ledger:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._changed = threading.Condition(threading.RLock())
-        self._cancelled: set[str] = set()
         self.trouble = ""
         self._entries = self._read()
 
@@ -137,8 +142,6 @@ class Ledger:
         with self._changed:
             for name, value in values.items():
                 setattr(entry, name, value)
-            if entry.is_over:
-                self._cancelled.discard(entry.id)
             self._write()
 
     def begin(self, entry: Entry) -> bool:
@@ -154,12 +157,12 @@ class Ledger:
             if entry.state == "waiting":
                 self.change(entry, state="cancelled", stage="", progress=None)
             elif not entry.is_over:
-                self._cancelled.add(entry.id)
+                self.change(entry, is_cancelled=True)
 
     def is_cancelled(self, entry: Entry) -> bool:
         """Return whether its end was asked for."""
         with self._changed:
-            return entry.id in self._cancelled
+            return entry.is_cancelled
 
     def disarm(self, entry: Entry, reason: str) -> None:
         """Do not print the result of an entry."""
@@ -192,11 +195,15 @@ class Ledger:
             ]
         except FileNotFoundError:
             return []
+        except OSError as error:  # of another user's rights, for instance
+            self._tell_trouble(f"{self._path} cannot be read: {error}")
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             aside = self._path.with_suffix(".unreadable")
             self._path.replace(aside)
-            self.trouble = f"{self._path.name} cannot be read ({error}); it is now {aside.name}"
-            return []
+            self._tell_trouble(
+                f"{self._path.name} cannot be read ({error}); it is now {aside.name}"
+            )
+        return []
 
     def _write(self) -> None:
         """Write all entries, whole or not at all."""
@@ -208,4 +215,9 @@ class Ledger:
                 os.fsync(file.fileno())
             part.replace(self._path)
         except OSError as error:
-            self.trouble = f"{self._path.name} cannot be written: {error}"
+            self._tell_trouble(f"{self._path.name} cannot be written: {error}")
+
+    def _tell_trouble(self, text: str) -> None:
+        if text != self.trouble:  # once, and not at every change of an entry
+            _LOGGER.error(text)
+        self.trouble = text

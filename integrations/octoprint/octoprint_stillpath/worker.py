@@ -128,27 +128,28 @@ class Worker:
         self._host.show(entry)
 
     def _attempt(self, entry: Entry) -> None:
-        source = self._source(entry)
-        self._wait_while(entry, self._host.busy_with)
-        digest = self._digest(entry, source)
-        self._folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=str(self._folder)) as folder:
-            compensator = self._host.compensator(
-                entry,
-                lambda stage, share: self._tell(entry, stage, share),
-                lambda **values: self._ledger.change(entry, **values),
-            )
-            try:
+        compensator = self._host.compensator(
+            entry,
+            lambda stage, share: self._tell(entry, stage, share),
+            lambda **values: self._ledger.change(entry, **values),
+        )
+        try:
+            source = self._source(entry)
+            self._wait_while(entry, self._host.busy_with)
+            digest = self._digest(entry, source)
+            self._folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryDirectory(dir=str(self._folder)) as folder:
                 made = compensator.run(source, Path(folder), entry.path.rpartition("/")[2])
-            except Cancelled:
-                compensator.cancel()
-                raise
-            self._wait_while(entry, self._host.occupied)
-            if self._digest(entry, self._source(entry)) != digest:
-                raise Failure("the file was changed meanwhile; what was made of it is not kept")
-            self._host.deliver(entry, made)
+                self._wait_while(entry, self._host.occupied)
+                if self._digest(entry, self._source(entry)) != digest:
+                    raise Failure("the file was changed meanwhile; what was made of it is not kept")
+                self._host.deliver(entry, made)
+        except Cancelled:
+            compensator.cancel()  # also a job that an earlier run of OctoPrint has left
+            raise
 
     def _source(self, entry: Entry) -> Path:
+        self._check(entry)  # an entry whose file is deleted is cancelled
         source = self._host.source(entry)
         if source is None:
             raise Failure("the file is gone: it was moved or deleted meanwhile")

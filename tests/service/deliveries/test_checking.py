@@ -205,14 +205,20 @@ def test_another_firmware(tmp_path: Path):
 
 def test_what_changed_since_the_first_check_until_it_is_accepted(tmp_path: Path):
     status = status_of(MACHINE)
+    # As remembered before drivers of second motors were: that they are there is no change.
     assert checked(tmp_path, status).findings == []
+    settings_of(status)["tmc2209 stepper_y1"] = {"run_current": 0.6}
+    assert checked(tmp_path, status).findings == []
+    assert checked(tmp_path, status, accept=True).findings == []
     settings_of(status)["stepper_x"]["rotation_distance"] = 32.0
     settings_of(status)["stepper_x"]["endstop_pin"] = "^PC7"
     settings_of(status)["tmc2209 stepper_x"]["run_current"] = 0.8
+    settings_of(status)["tmc2209 stepper_y1"]["run_current"] = 0.8
     first = checked(tmp_path, status)
     assert [finding.place for finding in first.findings] == [
         "[stepper_x] rotation_distance",
         "[tmc2209 stepper_x] run_current",
+        "[tmc2209 stepper_y1] run_current",
     ]
     assert "from 40 to 32" in first.findings[0].text
     assert "stillpath printers accept left" in first.findings[0].text
