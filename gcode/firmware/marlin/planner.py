@@ -84,8 +84,8 @@ class Planner(QueuePlanner):
 
     def _error(self, problem: int, moves: Moves, row: int) -> GcodeError:  # noqa: ARG002
         return GcodeError(
-            f"the move's speed is {moves.speed_mm_s[row]:g} mm/s; it must be above 0: correct its "
-            "F or M220",
+            f"the move's speed is {moves.speed_mm_s[row]:g} mm/s; it must be above 0: give it an "
+            "F, or correct M220",
             line=int(moves.line[row]),
         )
 
