@@ -35,14 +35,7 @@ def mean_response(responses: Sequence[FrequencyResponse]) -> FrequencyResponse:
     first = responses[0]
     if len(responses) == 1:
         return first
-    low = max(float(r.f_hz.min()) for r in responses)
-    high = min(float(r.f_hz.max()) for r in responses)
-    f = first.f_hz[(first.f_hz >= low) & (first.f_hz <= high)]
-    if len(f) < 2:
-        raise ModelError(
-            f"the {len(responses)} responses share no frequencies (the highest start is "
-            f"{low:.1f} Hz, the lowest end {high:.1f} Hz); fit them one by one"
-        )
+    f = _shared_hz(responses, "responses")
     moved = [on_grid(aligned_to(r, first), f) for r in responses]
     h = np.stack([r.response for r in moved])
     sd = np.stack([r.sd for r in moved])
@@ -82,14 +75,7 @@ def mean_spectrum(spectra: Sequence[Spectrum]) -> Spectrum:
             f"the {len(spectra)} spectra share no column (the first has {', '.join(first.psd)}); "
             "fit them one by one"
         )
-    low = max(float(s.f_hz.min()) for s in spectra)
-    high = min(float(s.f_hz.max()) for s in spectra)
-    f = first.f_hz[(first.f_hz >= low) & (first.f_hz <= high)]
-    if len(f) < 2:
-        raise ModelError(
-            f"the {len(spectra)} spectra share no frequencies (the highest start is {low:.1f} Hz, "
-            f"the lowest end {high:.1f} Hz); fit them one by one"
-        )
+    f = _shared_hz(spectra, "spectra")
     tiny = np.finfo(float).tiny
     logs = {
         name: np.mean(
@@ -103,6 +89,20 @@ def mean_spectrum(spectra: Sequence[Spectrum]) -> Spectrum:
         psd={name: np.exp(log) for name, log in logs.items()},
         notes=tuple(dict.fromkeys(n for s in spectra for n in s.notes)),
     )
+
+
+def _shared_hz(measured: Sequence[FrequencyResponse | Spectrum], what: str) -> Array:
+    """Return the frequencies of the first measurement that lie in the bands of all."""
+    low = max(float(one.f_hz.min()) for one in measured)
+    high = min(float(one.f_hz.max()) for one in measured)
+    own = measured[0].f_hz
+    shared: Array = own[(own >= low) & (own <= high)]
+    if len(shared) < 2:
+        raise ModelError(
+            f"the {len(measured)} {what} share no frequencies (the highest start is {low:.1f} Hz, "
+            f"the lowest end {high:.1f} Hz); fit them one by one"
+        )
+    return shared
 
 
 def aligned_to(response: FrequencyResponse, reference: FrequencyResponse) -> FrequencyResponse:
