@@ -244,8 +244,10 @@ class ChosenMeter:
         return self._measure(self._path.shape[1] - self._window)
 
     def flush(self) -> Array:
-        """Return the errors of the samples still waiting; their window ends with the motion."""
-        return self._measure(self._path.shape[1])
+        """Return the errors of the samples still waiting; see `ContourMeter.flush`."""
+        errors = self._measure(self._path.shape[1])
+        self._path = self._path[:, :0]
+        return errors
 
     def _measure(self, stop: int) -> Array:
         count = int(np.searchsorted(self._centres, stop))

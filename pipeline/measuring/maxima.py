@@ -26,7 +26,8 @@ _STILL_MM = 1e-9
 class Maxima:
     """Find the largest errors on lines and after their ends: overall, by layer and by feature.
 
-    Those of a layer are exact only after the ends of its lines.
+    On lines, only the largest of a feature is found, in the channel `exact`; those of a layer and
+    of other channels may lie between the samples that are measured.
 
     Parameters
     ----------
@@ -55,7 +56,8 @@ class Maxima:
         self.jump()
 
     def jump(self) -> None:
-        """Forget the position."""
+        """Forget the position: all that was added was answered."""
+        self._note(self._errors.flush())
         self._printed = self._moved = -self._reach - 1
         self._of = (-1, -1)
         self._at: Array | None = None
