@@ -344,8 +344,9 @@ class PreviewFbf:
             f"{bounds.accel / dt**2:.0f} mm/s2, {bounds.speed / dt:.0f} mm/s and {bounds.low_mm:g} "
             f"to {bounds.high_mm:g} mm; the path itself asks for {path.accel / dt**2:.0f} mm/s2, "
             f"{path.speed / dt:.0f} mm/s and {path.low_mm:g} to {path.high_mm:g} mm (allowed are "
-            f"the command and travel limits of the machine, but at most {ACCEL_RATIO:g} times the "
-            "path's acceleration; docs/proof.md tells how to measure what the motors bear)"
+            f"the command and travel limits of the machine, and at most {ACCEL_RATIO:g} times the "
+            "path's acceleration, or a quarter of that limit; docs/proof.md tells how to measure "
+            "what the motors bear)"
         )
 
 
