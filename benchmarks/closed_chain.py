@@ -334,7 +334,7 @@ def identified(
     typed: dict[str, PlantSetSpec] = {}
     for axis in ("x", "y"):
         for run in range(3 if source == "raw" else 1):
-            record = run_test(printer, axis, sensor, rng, test)
+            record = run_test(printer, axis, sensor, rng, test, rests=source != "raw")
             name = f"resonances_{axis}_{run}.csv"
             (table,) = read_content(record.resonances(), name, settings=settings)
             assert isinstance(table, Spectrum)

@@ -6,18 +6,18 @@ a set. What was measured with a weight on the bed or at different places becomes
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, TypeAlias
+from typing import TypeAlias
 
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.alignment import (
     AlignedLog,
     align,
-    check_pair,
     spectrum_along,
 )
 from stillpath.models.identification.averaging import mean_response, mean_spectrum
+from stillpath.models.identification.clocks import Lateness, lateness, timed
 from stillpath.models.identification.conditioned import (
     check_labels,
     of_one_test,
@@ -56,7 +56,7 @@ from stillpath.models.identification.readers import (
 )
 from stillpath.models.identification.sets import (
     Origin,
-    delay_warning,
+    delays_compared,
     model_file_set,
     response_set,
     spectrum_set,
@@ -67,9 +67,14 @@ from stillpath.models.identification.spectrum_fit import (
     refit_spectrum,
     same_test,
 )
-from stillpath.models.identification.trust import check_axes, check_informative, keeps_time
+from stillpath.models.identification.trust import (
+    check_axes,
+    check_directions,
+    check_informative,
+)
 from stillpath.models.identification.types import (
     AccelerationLog,
+    Axis,
     AxisIdentification,
     DrivenLog,
     Excitation,
@@ -79,12 +84,11 @@ from stillpath.models.identification.types import (
     PlantModel,
     Spectrum,
 )
-from stillpath.models.plants import PlantSetSpec
+from stillpath.models.plants import PlantSetSpec, PlantSpec
 from stillpath.models.provenance import Kind, SourceFile
 
 __all__ = ["Measured", "Progress", "identify"]
 
-Axis: TypeAlias = Literal["x", "y"]
 Progress: TypeAlias = Callable[[str, float], None]
 """Called with what is being done and how much of all is done, 0 to 1."""
 
@@ -150,10 +154,11 @@ def identify(
         note = no_frame_note(frames_hz)
         found = {axis: replace(one, notes=(*one.notes, note)) for axis, one in found.items()}
     if not settings.sensor_turned:
-        _check_directions(found)
+        check_directions(found.values())
     check_axes(list(found.values()))
+    found = timed(found, {axis: work.late for axis, work in works.items()})
     steps.say("done", 1.0)
-    return _delays_compared(found)
+    return delays_compared(found)
 
 
 class _Steps:
@@ -191,6 +196,10 @@ class _AxisWork:
         self._aligned: list[AlignedLog] = []
         """Of the raw logs that are used."""
         self._friction_mm = 0.0
+        self._earlier_s = 0.0
+        """By how much friction made alignment place the starts of the tests too late."""
+        self.late: list[Lateness] = []
+        """Of the raw logs that led to plants with their phase."""
         self._spectra: list[tuple[Spectrum, Excitation, Condition]] = []
         self._explanations: Explanations | None = None
         kind = next(k for k in _BEST_FIRST if any(isinstance(m.measurement, k) for m in measured))
@@ -226,6 +235,7 @@ class _AxisWork:
         else:
             found = self._from_responses()
             if self._kind == "raw log" and found.fit and poorly_explained(found.fit):
+                self.late = []
                 found = self._from_magnitudes(found.fit, frame_likely)
         self._steps.stepped(f"axis {self._axis}: fitted")
         notes = list(found.notes)
@@ -292,6 +302,8 @@ class _AxisWork:
             warnings = level_warnings(chosen, nominal)
             mounting = [] if self._settings.sensor_axis else mounting_notes(self._axis, chosen)
             notes = [*mounting, *body_notes(self._friction_mm, frame)]
+            at = [k for k, (_, c) in enumerate(responses) if c in common]
+            self.late = self._lateness(at, chosen, found.plants.nominal)
         else:
             warnings = scale_warnings(chosen, nominal)
         found = replace(
@@ -416,6 +428,7 @@ class _AxisWork:
         self._friction_mm = found.held_mm
         if not found.held_mm:
             return list(responses)
+        self._earlier_s = found.late_s
         return [
             (self._freed(k, response, motions[found.motion][k], found), condition)
             for k, (response, condition) in enumerate(responses)
@@ -437,6 +450,19 @@ class _AxisWork:
             for aligned in freed(self._aligned[number], motion, friction)
         )
         return replace(better_explained(sliding, stuck), notes=response.notes)
+
+    def _lateness(
+        self, numbers: Sequence[int], responses: Sequence[FrequencyResponse], plant: PlantSpec
+    ) -> list[Lateness]:
+        """Return how late the axis follows in each log."""
+        out = []
+        for number, response in zip(numbers, responses, strict=True):
+            log = self._used[number].measurement
+            assert isinstance(log, AccelerationLog)
+            test = excitation_for(log, self._settings)
+            started_s = self._aligned[number].start_s - self._earlier_s
+            out.append(lateness(log, test, started_s, response, plant))
+        return out
 
     def _rubbing(self, plants: PlantSetSpec) -> PlantSetSpec:
         return plants.model_copy(update={"friction_mm": self._friction_mm or None})
@@ -468,27 +494,3 @@ def _axis(measurement: Measurement, settings: ReadSettings) -> Axis:
             "X and Y from tests along X and along Y"
         )
     return "x" if abs(x) > abs(y) else "y"
-
-
-def _check_directions(found: Mapping[Axis, AxisIdentification]) -> None:
-    along = [
-        (r.source, r.sensor_direction)
-        for one in found.values()
-        for r in one.measured[:1]
-        if isinstance(r, FrequencyResponse) and r.sensor_direction is not None
-    ]
-    if len(along) == 2:
-        (x, x_direction), (y, y_direction) = along
-        try:
-            check_pair(x_direction, y_direction)
-        except ModelError as error:
-            raise ModelError(f"{x}, {y}: {error}") from None
-
-
-def _delays_compared(found: dict[Axis, AxisIdentification]) -> dict[Axis, AxisIdentification]:
-    """Warn about delays that differ, where they are known: a log does not say when it began."""
-    fits = [one.fit for _, one in sorted(found.items()) if keeps_time(one) and one.fit]
-    warning = delay_warning(fits[0], fits[1]) if len(fits) == 2 else None
-    if warning is None:
-        return found
-    return {a: replace(one, warnings=(*one.warnings, warning)) for a, one in found.items()}

@@ -8,7 +8,7 @@ from stillpath.models.identification.sanathanan_koerner import pairs_of
 from stillpath.models.identification.types import Fit
 from stillpath.models.plants import PairsSpec, PlantSpec, PolePair, RelativeModesSpec, ZeroPair
 
-__all__ = ["advanced", "delay_of", "prompt"]
+__all__ = ["advanced", "delay_of", "delayed", "prompt"]
 
 _MOST_ZETA = 10.0
 """Largest damping ratio of a pair of real zeros: beyond, one of them lies decades away."""
@@ -29,6 +29,25 @@ def advanced(plant: PlantSpec) -> PlantSpec:
     if isinstance(plant, RelativeModesSpec) and plant.delay_s != 0.0:
         plant = _as_pairs(plant) or plant.without_delay()
     return plant.without_delay() if isinstance(plant, PairsSpec) else plant
+
+
+def delayed(plant: PlantSpec, delay_s: float) -> PlantSpec:
+    """Return a plant without delay whose slow motion is late, as guides that damp it make it.
+
+    At most all of the damping acts against the guides; other structures are returned unchanged.
+    """
+    if isinstance(plant, PairsSpec):
+        most_s = sum(pole.zeta / (np.pi * pole.f_hz) for pole in plant.poles)
+        tau_s = plant.real_zero_tau_s - min(delay_s, most_s)
+        return plant.model_copy(update={"real_zero_tau_s": float(tau_s)})
+    if isinstance(plant, RelativeModesSpec):
+        most = [mode.model_copy(update={"grounded": 1.0}) for mode in plant.modes]
+        most_s = RelativeModesSpec(modes=tuple(most)).delay_s
+        grounded = min(1.0, delay_s / most_s) if most_s > 0.0 else 0.0
+        return RelativeModesSpec(
+            modes=tuple(m.model_copy(update={"grounded": grounded}) for m in plant.modes)
+        )
+    return plant
 
 
 def delay_of(plant: PlantSpec) -> float:

@@ -7,7 +7,7 @@ such a measurement.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import date
 
 import numpy as np
@@ -21,7 +21,9 @@ from stillpath.models.identification.prompt import delay_of, prompt
 from stillpath.models.identification.response_bootstrap import explain_response
 from stillpath.models.identification.response_data import coherent_part
 from stillpath.models.identification.spectrum_fit import Explanations
+from stillpath.models.identification.trust import keeps_time
 from stillpath.models.identification.types import (
+    Axis,
     AxisIdentification,
     Fit,
     FrequencyResponse,
@@ -40,6 +42,7 @@ __all__ = [
     "PARAMETRIC_SPREAD",
     "Origin",
     "delay_warning",
+    "delays_compared",
     "measured_modes",
     "model_file_set",
     "parametric_members",
@@ -287,6 +290,15 @@ def delay_warning(x: Fit, y: Fit) -> str | None:
         f"Y {y.delay_s * 1e3:.2f} ms), more than {_DELAYS_DIFFER_S * 1e3:g} ms: corners would "
         "shear; measure both axes again in one session"
     )
+
+
+def delays_compared(found: dict[Axis, AxisIdentification]) -> dict[Axis, AxisIdentification]:
+    """Warn about delays that differ, where the measurement shared a clock with its command."""
+    fits = [one.fit for _, one in sorted(found.items()) if keeps_time(one) and one.fit]
+    warning = delay_warning(fits[0], fits[1]) if len(fits) == 2 else None
+    if warning is None:
+        return found
+    return {a: replace(one, warnings=(*one.warnings, warning)) for a, one in found.items()}
 
 
 def _by_label(measured: Sequence[FrequencyResponse]) -> list[list[FrequencyResponse]]:

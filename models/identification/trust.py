@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
 from stillpath.models.errors import ModelError
+from stillpath.models.identification.alignment import check_pair
 from stillpath.models.identification.response_data import LEAST_COHERENCE, coherent
 from stillpath.models.identification.types import (
     AxisIdentification,
@@ -15,7 +16,13 @@ from stillpath.models.identification.types import (
     Spectrum,
 )
 
-__all__ = ["check_axes", "check_informative", "keeps_time", "main_mode_known"]
+__all__ = [
+    "check_axes",
+    "check_directions",
+    "check_informative",
+    "keeps_time",
+    "main_mode_known",
+]
 
 _LEAST_SHARE, _LEAST_COUNT = 0.1, 30
 _PRINTERS_HZ = 150.0
@@ -111,6 +118,22 @@ def check_axes(found: Sequence[AxisIdentification]) -> None:
             f"{of_y.delay_s * 1e3:.2f} ms), at most {_MOST_APART_S * 1e3:g} ms is to be expected "
             "of one machine: clocks that differ, or noise. Measure both axes again in one session"
         )
+
+
+def check_directions(found: Iterable[AxisIdentification]) -> None:
+    """Refuse logs of X and Y that moved the sensor along the same of its directions."""
+    along = [
+        (r.source, r.sensor_direction)
+        for one in found
+        for r in one.measured[:1]
+        if isinstance(r, FrequencyResponse) and r.sensor_direction is not None
+    ]
+    if len(along) == 2:
+        (x, x_direction), (y, y_direction) = along
+        try:
+            check_pair(x_direction, y_direction)
+        except ModelError as error:
+            raise ModelError(f"{x}, {y}: {error}") from None
 
 
 def keeps_time(found: AxisIdentification) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from stillpath.models.schedule import AxisSchedule
 
 __all__ = [
     "AccelerationLog",
+    "Axis",
     "AxisIdentification",
     "DrivenLog",
     "Excitation",
@@ -25,6 +26,8 @@ __all__ = [
     "PlantModel",
     "Spectrum",
 ]
+
+Axis: TypeAlias = Literal["x", "y"]
 
 
 @dataclass(frozen=True, slots=True)

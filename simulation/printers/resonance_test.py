@@ -22,6 +22,8 @@ OLD_TEST = Excitation((1.0, 0.0), 5.0, 133.33, 75.0, 1.0, 0.0)
 NEW_TEST = Excitation((1.0, 0.0))
 _GRAVITY_MM_S2 = 9806.65
 _DWELL_S = 0.5
+_BEGAN_S = 10.0 + _DWELL_S
+"""When the test begins, on the clock of the command."""
 _HIGHEST_HZ = 200.0
 _CHIPS = {"adxl345": (3200.0, 38.3), "lis2dw": (1600.0, 2.4)}
 """Rate in Hz and step in mm/s2."""
@@ -107,10 +109,18 @@ def run_test(
     sensor: Accelerometer,
     rng: np.random.Generator,
     test: Excitation = NEW_TEST,
+    *,
+    rests: bool = True,
 ) -> Record:
     """Test an axis, "x" or "y"; the machine changes slightly from run to run.
 
     Stiffnesses move by 1 % (half of that in frequency), dry friction by 10 %, from run to run.
+
+    Parameters
+    ----------
+    rests : bool
+        Whether the rests before and after are recorded too. Klipper's raw logs lack them: they hold
+        what is sampled between the first move and the last (klippy/extras/adxl345.py, 2026-08-07).
     """
     number = "xy".index(axis)
     profile = regenerate(replace(test, direction=(1.0, 0.0) if number == 0 else (0.0, 1.0)))
@@ -126,7 +136,12 @@ def run_test(
     if printer.kind == "bed slinger":
         # The sensor sits on the head in tests of X and on the bed in those of Y.
         accel[1 - number] = 0.0
-    return sensor.record(time_s + _DWELL_S + 10.0, accel, rng)
+    record = sensor.record(time_s + _BEGAN_S, accel, rng)
+    if rests:
+        return record
+    since_s = record.time_s - sensor.offset_s - _BEGAN_S
+    kept = (since_s >= 0.0) & (since_s <= profile.duration_s)
+    return Record(record.time_s[kept], record.accel_mm_s2[kept])
 
 
 def _another_day(bodies: Bodies, rng: np.random.Generator) -> Bodies:
