@@ -214,6 +214,28 @@ def test_list_page_and_report_say_the_same(
         expect(page.locator("main")).to_contain_text("no piece of the file was to be compensated")
 
 
+def test_a_job_says_what_became_of_its_delivery(visitor: Visitor, gear: dict[str, Any]):
+    """Done is not started: the printer may have refused it."""
+    sending = {"kind": "printer", "target": "left", "state": "sending", "attempts": 1}
+    refused = sending | {"state": "failed", "error": "File is loaded; send it again"}
+    after = iter([sending | {"error": None}, refused])
+
+    def answer(route: Route) -> None:
+        job = gear | {"printer": "left", "print": True}
+        job["deliveries"] = [next(after) | {"next_at": None}] if shown else []
+        shown.append(job)
+        route.fulfill(body=json.dumps(job), content_type="application/json")
+
+    shown: list[Any] = []
+    page = visitor.open("#/")
+    page.route(re.compile(rf"/v1/jobs/{gear['id']}$"), answer)
+    page.goto(f"{visitor.url}/#/jobs/{gear['id']}")
+    sent = page.get_by_role("list", name="Sent on")
+    expect(sent).to_have_text("Sending to the printer left failed: File is loaded; send it again")
+    expect(page.locator(".headline")).to_be_visible()
+    assert len(shown) == 3
+
+
 def test_a_job_that_is_not_there(visitor: Visitor):
     visitor.expected = {404}
     page = visitor.open("#/nowhere")
