@@ -25,7 +25,7 @@ from stillpath.service.deliveries.printers import Printer, printer_for, upload, 
 from stillpath.service.deliveries.rows import Delivery
 from stillpath.service.deliveries.targets import TargetRefused, check_webhook
 from stillpath.service.deliveries.webhooks import send_webhook
-from stillpath.service.jobs.state import Job
+from stillpath.service.jobs.state import START_WITHIN_S, Job
 from stillpath.service.jobs.store import JobStore
 from stillpath.service.settings import Settings
 from stillpath.service.storage.base import Storage, StorageError, sha256_of
@@ -61,7 +61,7 @@ class SendingTimes:
     attempts: int = 10
     claim_s: float = 60.0
     poll_s: float = 1.0
-    start_within_s: float = 3600.0
+    start_within_s: float = START_WITHIN_S
 
     def wait_s(self, attempts: int) -> float:
         """Return how long the next attempt waits after so many (1, 2, ...)."""

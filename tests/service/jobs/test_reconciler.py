@@ -84,6 +84,21 @@ def test_every_attempt_has_its_moment_of_grace(site: Site, monkeypatch: pytest.M
     assert site.get(job_id).losses == 1
 
 
+@pytest.mark.parametrize("away_h", [0.5, 72.0])
+@pytest.mark.parametrize("submitted_h", [0.0, 73.0])
+def test_a_print_is_not_started_days_after_it_was_expected(
+    site: Site, away_h: float, submitted_h: float
+):
+    """Somebody switches the computer on again: a queue that was honestly long goes on."""
+    now = time.time()
+    look = looking(site, Workers())
+    site.store.lease("reconciler", "the last service", 5.0, now - away_h * 3600)
+    created_at = now - submitted_h * 3600
+    job_id = site.submit("G1", printer="left", print_after=True, created_at=created_at)
+    look._tick()
+    assert site.get(job_id).print_after == (min(away_h, submitted_h) < 1.0)
+
+
 def test_a_job_waits_until_the_disk_of_the_storage_has_room(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
