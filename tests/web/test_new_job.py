@@ -91,6 +91,27 @@ def test_the_machine_is_found_by_typing_and_remembered(visitor: Visitor):
     expect(field).to_have_value(chosen)
 
 
+def test_a_finger_scrolls_the_machines_and_chooses_by_tapping(visitor: Visitor):
+    page = visitor.open(viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True)
+    field = page.get_by_role("combobox", name="Machine")
+    field.tap()
+    options = page.get_by_role("listbox")
+    before, first = field.input_value(), options.get_by_role("option").nth(2)
+    place = first.bounding_box()
+    assert place is not None
+    x, y = place["x"] + 40, place["y"] + place["height"] / 2
+    touch = page.context.new_cdp_session(page)
+    for kind, at in [("touchStart", y), *[("touchMove", y - k) for k in range(5, 120, 5)]]:
+        touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": [{"x": x, "y": at}]})
+    touch.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+    expect(options).to_be_visible()
+    assert options.evaluate("list => list.scrollTop") > 0
+    assert field.input_value() == before
+    options.get_by_role("option").nth(5).tap()
+    expect(options).to_be_hidden()
+    assert field.input_value() != before
+
+
 def test_a_file_that_is_no_gcode_is_refused_with_the_reason(visitor: Visitor, tmp_path: Path):
     file = tmp_path / "photo.gcode"
     file.write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(range(256)) * 40)
