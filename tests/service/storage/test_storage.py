@@ -258,6 +258,37 @@ def test_the_settings_choose(tmp_path: Path):
             open_storage(Settings(data_dir=tmp_path, storage_url=wrong))
 
 
+def test_a_disk_that_is_away_is_an_error_and_nothing_goes_to_another(tmp_path: Path):
+    """Its folder is empty then, or not there; the first start alone makes it."""
+    root, file = tmp_path / "usb", tmp_path / "file"
+    chosen = Settings(data_dir=tmp_path / "data", storage_url=root.as_uri())
+    put(open_storage(chosen), "jobs/a/b", b"x", tmp_path)
+    root.rename(tmp_path / "away")
+    storage = open_storage(chosen)
+    for mount_point in ("not there", "empty"):
+        if mount_point == "empty":
+            root.mkdir()
+        file.write_bytes(b"x")
+        for use in (
+            storage.check,
+            storage.room,
+            lambda: storage.stat("jobs/a/b"),
+            lambda: next(storage.read("jobs/a/b", 0, 1)),
+            lambda: list(storage.list("jobs/")),
+            lambda: storage.put("jobs/a/c", file),
+            lambda: storage.delete("jobs/a/"),
+            lambda: storage.local("jobs/a/b").__enter__(),
+        ):
+            with pytest.raises(StorageError, match="is its disk mounted"):
+                use()
+        assert file.exists()
+    root.rmdir()  # nothing is in it
+    (tmp_path / "away").rename(root)
+    assert content(storage, "jobs/a/b") == b"x"
+    elsewhere = chosen.model_copy(update={"storage_url": (tmp_path / "new").as_uri()})
+    open_storage(elsewhere).check()
+
+
 def test_what_a_kill_left_is_deleted_when_it_is_old(tmp_path: Path):
     LocalStorage(tmp_path)
     old, fresh = tmp_path / ".fresh" / "old", tmp_path / ".fresh" / "fresh"
