@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import ipaddress
+import json
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, Any, Self
 
-from pydantic import AfterValidator, Field, SecretStr, model_validator
-from pydantic_settings import BaseSettings, SettingsConfigDict
+from pydantic import AfterValidator, BeforeValidator, Field, SecretStr, model_validator
+from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from stillpath.applications.machines.settings import (
     ENV_PREFIX,
@@ -27,7 +28,22 @@ def _network(text: str) -> str:
         ) from None
 
 
+def _listed(value: Any) -> Any:
+    """Read a list as a variable holds it."""
+    if not isinstance(value, str):
+        return value
+    if not value.lstrip().startswith("["):
+        return [part.strip() for part in value.split(",") if part.strip()]
+    try:
+        return json.loads(value)
+    except ValueError:
+        raise ValueError('is no list; write for instance a,b or ["a", "b"]') from None
+
+
 Network = Annotated[str, AfterValidator(_network)]
+# Without NoDecode, what is not JSON would be an error that names neither value nor remedy.
+Hosts = Annotated[list[str], NoDecode, BeforeValidator(_listed)]
+Networks = Annotated[list[Network], NoDecode, BeforeValidator(_listed)]
 
 
 def _data_dir() -> Path:
@@ -39,7 +55,7 @@ def _data_dir() -> Path:
 
 
 class Settings(MachineSettings, BaseSettings):
-    """Settings of one process of the service.
+    """Settings of one process of the service. In a variable a list is JSON, or ``a,b``.
 
     One computer needs none of the first three: SQLite, a folder, and worker processes of its own.
     With several, all three are elsewhere.
@@ -125,10 +141,10 @@ class Settings(MachineSettings, BaseSettings):
     keep_days: Annotated[float, Field(gt=0)] = 30.0
     keys: bool | None = None
     first_key: SecretStr | None = None
-    allowed_hosts: list[str] = []
-    trusted_proxies: list[Network] = []
+    allowed_hosts: Hosts = []
+    trusted_proxies: Networks = []
     printers: Path | None = None
-    webhook_targets: list[str] = []
+    webhook_targets: Hosts = []
     webhook_secret: SecretStr | None = None
 
     @model_validator(mode="after")
