@@ -34,6 +34,7 @@ def test_a_list_may_be_json_or_have_commas(
     [
         ("ALLOWED_HOSTS", "['a']", 'write for instance a,b or ["a", "b"]'),
         ("TRUSTED_PROXIES", "nginx", "is not an address or network"),
+        ("WEBHOOK_SECRET", "hunter2", "has 7 characters, which can be guessed; give 16 or more"),
     ],
 )
 def test_what_cannot_be_meant_is_named(
@@ -44,3 +45,12 @@ def test_what_cannot_be_meant_is_named(
         service_settings()
     assert str(caught.value).startswith(f"STILLPATH_{name}: ")
     assert said in str(caught.value)
+    assert "hunter2" not in str(caught.value)
+
+
+def test_an_empty_secret_is_none(monkeypatch: pytest.MonkeyPatch):
+    """Compose passes on an empty variable: nothing is signed with a key that everybody knows."""
+    for name in ("WEBHOOK_SECRET", "FIRST_KEY"):
+        monkeypatch.setenv(f"STILLPATH_{name}", "")
+    settings = service_settings()
+    assert (settings.webhook_secret, settings.first_key) == (None, None)
