@@ -216,7 +216,9 @@ class Reconciler:
         if time.monotonic() - self._steady_since > timeout_s:
             for job in self._store.silent(time.time() - timeout_s):
                 reason = f"nothing was heard of its worker {job.worker} for {timeout_s:g} s"
-                self._give_back(job.id, job.attempt, reason)
+                # Our own workers end with their service: an earlier one began what we did not.
+                ended = self._cluster.is_own and job.id not in self._in_flight
+                self._give_back(job.id, job.attempt, reason, blame=not ended)
 
     def _collect(self) -> None:
         """Drop finished futures; a job that is still running then has lost its worker.

@@ -84,6 +84,22 @@ def test_every_attempt_has_its_moment_of_grace(site: Site, monkeypatch: pytest.M
     assert site.get(job_id).losses == 1
 
 
+@pytest.mark.parametrize("own", [True, False])
+@pytest.mark.parametrize("ours", [True, False])
+def test_a_service_that_was_killed_is_no_loss_of_its_jobs(site: Site, own: bool, ours: bool):
+    """With PostgreSQL its jobs are found by silence; remote workers outlive a service."""
+    look = looking(site, Workers(is_own=own))
+    job_id = site.submit("G1")
+    look._tick()
+    site.store.apply(job_id, Claimed(time.time() - 3600.0, "w"))
+    if not ours:
+        look._forget()
+    look._steady_since -= 3600.0
+    look._tick()
+    job = site.get(job_id)
+    assert (job.state, job.losses) == (JobState.QUEUED, int(ours or not own))
+
+
 @pytest.mark.parametrize("away_h", [0.5, 72.0])
 @pytest.mark.parametrize("submitted_h", [0.0, 73.0])
 def test_a_print_is_not_started_days_after_it_was_expected(
