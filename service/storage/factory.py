@@ -35,7 +35,7 @@ def open_storage(settings: Settings) -> Storage:
     match parts.scheme:
         case "s3":
             return S3Storage(settings.storage_url, settings.data_dir / "scratch")
-        case "file" if parts.netloc in ("", "localhost"):
+        case "file" if parts.netloc in ("", "localhost") and parts.path.startswith("/"):
             return _in_folder(Path(url2pathname(parts.path)), settings.data_dir)
     raise ValueError(
         f"STILLPATH_STORAGE_URL: {settings.storage_url!r} is neither s3://bucket/prefix nor "

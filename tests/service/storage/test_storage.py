@@ -245,7 +245,7 @@ def test_a_bucket_that_is_not_there_is_an_error_of_the_storage(s3_address: str, 
         storage.check()
 
 
-def test_the_settings_choose(tmp_path: Path):
+def test_the_settings_choose(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     assert isinstance(open_storage(Settings(data_dir=tmp_path)), LocalStorage)
     address = f"http://127.0.0.1:{free_port()}"
     there = Settings(data_dir=tmp_path, storage_url=f"s3://b/p?endpoint={address}&region=eu-1")
@@ -253,7 +253,8 @@ def test_the_settings_choose(tmp_path: Path):
     folder = Settings(data_dir=tmp_path, storage_url=(tmp_path / "else").as_uri())
     open_storage(folder).check()
     assert (tmp_path / "else").is_dir()
-    for wrong in ("ftp://b", "s3://", "s3://b?what=1"):
+    monkeypatch.chdir(tmp_path)
+    for wrong in ("ftp://b", "s3://", "s3://b?what=1", "file:relative", "file:", "file://"):
         with pytest.raises(ValueError, match="s3://bucket"):
             open_storage(Settings(data_dir=tmp_path, storage_url=wrong))
 
