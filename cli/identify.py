@@ -313,13 +313,15 @@ def _stored(
     sources: Sequence[SourceFile],
 ) -> Revision | None:
     """Make a revision, before anything else is written: the store may refuse."""
+    from stillpath.applications.machines.revision import identified_from
+
     if target.machine is None:
         return None
     return machines.store.add_revision(
         target.machine,
         machine,
         author=who(note.by),
-        message=note.message or f"identified from {', '.join(s.name for s in sources)}",
+        message=note.message or identified_from(sources),
         sources=sources,
         expected=expected,
     )

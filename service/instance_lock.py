@@ -15,8 +15,10 @@ from pathlib import Path
 
 from stillpath.service.permissions import private_folder
 
-__all__ = ["exclusive"]
+__all__ = ["RESTORING", "exclusive", "is_half_restored"]
 
+RESTORING = ".restoring"
+"""Folder in the data directory from which a restore moves everything in, the database last."""
 _TAKEN = (errno.EAGAIN, errno.EACCES, errno.EDEADLK)
 
 
@@ -45,6 +47,12 @@ def exclusive(folder: Path) -> Iterator[None]:
         yield
     finally:
         os.close(handle)
+
+
+def is_half_restored(folder: Path) -> bool:
+    """Return whether a restore into a data directory was broken off."""
+    fresh = folder / RESTORING
+    return fresh.is_dir() and any(fresh.iterdir())
 
 
 def _lock(handle: int) -> None:

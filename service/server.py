@@ -89,8 +89,11 @@ def serve_forever(
 
 def _listening(host: str, port: int) -> socket.socket:
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    both = _is_dual(host)
     try:
-        return socket.create_server((host, port), family=family, backlog=_BACKLOG)
+        return socket.create_server(
+            (host, port), family=family, backlog=_BACKLOG, dualstack_ipv6=both
+        )
     except OSError as error:
         if error.errno != errno.EADDRINUSE:
             raise
@@ -98,11 +101,17 @@ def _listening(host: str, port: int) -> socket.socket:
         raise OSError(error.errno, f"{taken} (0: any)") from None
 
 
+def _is_dual(host: str) -> bool:
+    """Return whether IPv4 is answered, too, where an IPv6 address is bound."""
+    return host == "::" and socket.has_dualstack_ipv6()
+
+
 def _addresses(host: str, port: int) -> list[str]:
     """Return where a browser finds the service, on this computer first."""
     if host in ("0.0.0.0", "::", ""):
         name = socket.gethostname()
-        return [f"http://127.0.0.1:{port}/", f"http://{name}:{port}/ (from other computers)"]
+        here = "[::1]" if host == "::" and not _is_dual(host) else "127.0.0.1"
+        return [f"http://{here}:{port}/", f"http://{name}:{port}/ (from other computers)"]
     shown = f"[{host}]" if ":" in host else host
     return [f"http://{shown}:{port}/"]
 

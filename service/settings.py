@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import ipaddress
+import json
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, Any, Self
 
-from pydantic import AfterValidator, Field, SecretStr, model_validator
-from pydantic_settings import BaseSettings, SettingsConfigDict
+from pydantic import AfterValidator, BeforeValidator, Field, SecretStr, model_validator
+from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from stillpath.applications.machines.settings import (
     ENV_PREFIX,
@@ -16,6 +17,8 @@ from stillpath.applications.machines.settings import (
 )
 
 __all__ = ["Settings", "is_loopback"]
+
+_SHORTEST_SECRET = 16
 
 
 def _network(text: str) -> str:
@@ -27,7 +30,36 @@ def _network(text: str) -> str:
         ) from None
 
 
+def _listed(value: Any) -> Any:
+    """Read a list as a variable holds it."""
+    if not isinstance(value, str):
+        return value
+    if not value.lstrip().startswith("["):
+        return [part.strip() for part in value.split(",") if part.strip()]
+    try:
+        return json.loads(value)
+    except ValueError:
+        raise ValueError('is no list; write for instance a,b or ["a", "b"]') from None
+
+
+def _unless_empty(value: Any) -> Any:
+    """Take an empty variable, as Compose passes it on, for none."""
+    return None if value == "" else value
+
+
+def _is_long(secret: SecretStr | None) -> SecretStr | None:
+    if secret is not None and len(secret) < _SHORTEST_SECRET:
+        raise ValueError(
+            f"has {len(secret)} characters, which can be guessed; give {_SHORTEST_SECRET} or more"
+        )
+    return secret
+
+
 Network = Annotated[str, AfterValidator(_network)]
+# Without NoDecode, what is not JSON would be an error that names neither value nor remedy.
+Hosts = Annotated[list[str], NoDecode, BeforeValidator(_listed)]
+Networks = Annotated[list[Network], NoDecode, BeforeValidator(_listed)]
+Secret = Annotated[SecretStr | None, BeforeValidator(_unless_empty)]
 
 
 def _data_dir() -> Path:
@@ -39,7 +71,7 @@ def _data_dir() -> Path:
 
 
 class Settings(MachineSettings, BaseSettings):
-    """Settings of one process of the service.
+    """Settings of one process of the service. In a variable a list is JSON, or ``a,b``.
 
     One computer needs none of the first three: SQLite, a folder, and worker processes of its own.
     With several, all three are elsewhere.
@@ -99,7 +131,7 @@ class Settings(MachineSettings, BaseSettings):
         ``host`` or ``host:port`` that webhooks may be sent to, by https; ``http://host:port`` for
         plain http.
     webhook_secret : str, optional
-        Signs webhooks (HMAC-SHA256); without it there are none.
+        Signs webhooks (HMAC-SHA256), with at least 16 characters; without it there are none.
     """
 
     model_config = SettingsConfigDict(env_prefix=ENV_PREFIX, extra="forbid", frozen=True)
@@ -124,12 +156,12 @@ class Settings(MachineSettings, BaseSettings):
     requests_per_minute: Annotated[int, Field(ge=1)] = 1200
     keep_days: Annotated[float, Field(gt=0)] = 30.0
     keys: bool | None = None
-    first_key: SecretStr | None = None
-    allowed_hosts: list[str] = []
-    trusted_proxies: list[Network] = []
+    first_key: Secret = None
+    allowed_hosts: Hosts = []
+    trusted_proxies: Networks = []
     printers: Path | None = None
-    webhook_targets: list[str] = []
-    webhook_secret: SecretStr | None = None
+    webhook_targets: Hosts = []
+    webhook_secret: Annotated[Secret, AfterValidator(_is_long)] = None
 
     @model_validator(mode="after")
     def _together(self) -> Self:

@@ -8,8 +8,10 @@ from typing import Any
 
 import pytest
 import yaml
+from psycopg.pq import Conninfo
 
 from stillpath.applications.machines.settings import ENV_PREFIX
+from stillpath.service.database.engine import database_url
 from stillpath.service.settings import Settings
 
 ROOT = Path(__file__).parents[1]
@@ -33,10 +35,23 @@ def test_variables_are_settings_with_good_values(name, monkeypatch):
     known = {ENV_PREFIX + field.upper() for field in Settings.model_fields}
     given = environment(SERVICES[name])
     for variable, value in given.items():
-        assert variable in known or variable.startswith("AWS_"), variable
+        assert variable in known or variable.startswith(("AWS_", "PG")), variable
         if value is not None:
             monkeypatch.setenv(variable, value)
     Settings()
+
+
+@pytest.mark.parametrize("name", ["api-1", "api-2", "worker"])
+def test_the_database_takes_any_password(name, monkeypatch):
+    """PGPASSWORD is read by the driver: in an address, part of a password would be the host."""
+    for variable, value in SERVICES[name]["environment"].items():
+        if value is not None:
+            filled = value.replace("${POSTGRES_PASSWORD:-stillpath}", "p@ss/w:rd")
+            monkeypatch.setenv(variable, DEFAULT.sub(r"\1", filled))
+    url = database_url(Settings())
+    assert (url.username, url.password, url.host) == ("stillpath", None, "database")
+    read = {option.keyword: option.val for option in Conninfo.get_defaults()}
+    assert read[b"password"] == b"p@ss/w:rd"
 
 
 def test_profiles():

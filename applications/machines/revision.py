@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Sequence
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import (
@@ -27,12 +28,14 @@ __all__ = [
     "Revision",
     "UnknownMachine",
     "document_text",
+    "identified_from",
     "source_file",
 ]
 
 Who = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f]{1,100}$")]
 Message = Annotated[str, Field(pattern=r"^[^\x00-\x08\x0b-\x1f\x7f]{0,2000}$")]
 Number = Annotated[int, Field(ge=1, le=999_999)]
+_MOST_NAMED = 8
 _Kind = TypeVar("_Kind", bound=BaseModel)
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
@@ -129,6 +132,15 @@ def document_text(document: BaseModel) -> str:
 def source_file(name: str, content: bytes) -> SourceFile:
     """Return the name (no folder) and hash of a file that was read."""
     return SourceFile(name=name, sha256=hashlib.sha256(content).hexdigest())
+
+
+def identified_from(sources: Sequence[SourceFile]) -> str:
+    """Return the reason of a revision whose author gave none; `sources` names all files."""
+    names = ["".join(c if c.isprintable() else "?" for c in s.name)[:100] for s in sources]
+    more = len(names) - _MOST_NAMED
+    return f"identified from {', '.join(names[:_MOST_NAMED])}" + (
+        f" and {more} more" if more > 0 else ""
+    )
 
 
 def _checked(kind: type[_Kind], fields: dict[str, Any]) -> _Kind:

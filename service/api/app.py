@@ -7,6 +7,7 @@ from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
 from typing import Any
 
+from anyio import CapacityLimiter
 from fastapi import Depends, FastAPI
 from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import State
@@ -195,6 +196,7 @@ async def _open(app: FastAPI, settings: Settings, runner: Runner, stack: AsyncEx
     state.layers = results.Layers(storage)
     state.verified = Verified(storage)
     state.checker = Checker(open_documents(settings, engine, "printers"))
+    state.printer_checks = CapacityLimiter(printers.CHECKED_AT_ONCE)
     state.intake = Intake(
         settings,
         state.store,

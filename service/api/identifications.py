@@ -15,7 +15,7 @@ from starlette.responses import HTMLResponse
 from stillpath.applications.identification.archive import Archive
 from stillpath.applications.identification.figures import IdentificationReport
 from stillpath.applications.machines.resolve import Resolver
-from stillpath.applications.machines.revision import Revision
+from stillpath.applications.machines.revision import Revision, identified_from
 from stillpath.models.identification.readers.settings import ReadSettings
 from stillpath.models.machine import Machine
 from stillpath.models.store import explain
@@ -303,7 +303,7 @@ def _stored(
         name,
         machine,
         author=author,
-        message=message or f"identified from {', '.join(s.name for s in report.sources)}",
+        message=message or identified_from(report.sources),
         sources=report.sources,
         expected=expected,
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ipaddress
 import math
 import threading
 import time
@@ -137,7 +136,7 @@ class CallerLimits:
 
 def name_of(caller: Caller) -> str:
     """Return by which name a caller's requests are counted: the key's, or the address's."""
-    return f"key {caller.key_id}" if caller.key_id is not None else _network(caller.remote)
+    return f"key {caller.key_id}" if caller.key_id is not None else caller.network
 
 
 def unreadable(scope: Scope) -> Problem | None:
@@ -192,17 +191,3 @@ def limited_receive(scope: Scope, receive: Receive) -> Receive:
         return message
 
     return received
-
-
-def _network(remote: str | None) -> str:
-    """Return the address; of IPv6 the network, because one computer has all of it."""
-    try:
-        address = ipaddress.ip_address(remote or "")
-    except ValueError:
-        return remote or "unknown"
-    if isinstance(address, ipaddress.IPv6Address):
-        mapped = address.ipv4_mapped
-        if mapped is not None:
-            return str(mapped)
-        return str(ipaddress.ip_network((address, 64), strict=False))
-    return str(address)

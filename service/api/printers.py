@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Literal
 
+from anyio import CapacityLimiter, to_thread
 from fastapi import APIRouter, Path, Request
 from pydantic import BaseModel, Field
+from starlette.concurrency import run_in_threadpool
 
 from stillpath.applications.machines.resolve import Resolver
 from stillpath.models.errors import ModelError
@@ -17,7 +19,10 @@ from stillpath.service.deliveries.checking import Checker, PrinterCheck, Printer
 from stillpath.service.deliveries.printers import Printer
 from stillpath.service.security.audit import record
 
-__all__ = ["router"]
+__all__ = ["CHECKED_AT_ONCE", "router"]
+
+CHECKED_AT_ONCE = 8
+"""Checks that wait for printers in parallel: all other requests share the remaining threads."""
 
 router = APIRouter(prefix="/v1/printers", tags=["printers"])
 
@@ -59,13 +64,13 @@ def list_printers(request: Request, _: Reader) -> list[PrinterView]:
     responses=responses(401, 403, 404, 422, 424, 429),
     summary="Compare a printer with its machine",
 )
-def check_printer(request: Request, name: Name, _: Reader) -> PrinterCheck:
+async def check_printer(request: Request, name: Name, _: Reader) -> PrinterCheck:
     """Ask a Moonraker printer for its configuration and limits; say where the machine differs.
 
     The first check with a revision of the machine remembers the configuration; later ones tell what
     has changed since.
     """
-    return _checked(request, name, accept=False)
+    return await _checked(request, name, accept=False)
 
 
 @router.post(
@@ -73,14 +78,21 @@ def check_printer(request: Request, name: Name, _: Reader) -> PrinterCheck:
     responses=responses(401, 403, 404, 422, 424, 429),
     summary="Accept the current printer configuration",
 )
-def accept_printer(request: Request, name: Name, caller: Admin) -> PrinterCheck:
+async def accept_printer(request: Request, name: Name, caller: Admin) -> PrinterCheck:
     """Remember the current configuration; later checks report changes since then."""
-    found = _checked(request, name, accept=True)
-    record(request, caller, "printer.accept", name, machine=found.machine)
+    found = await _checked(request, name, accept=True)
+    await run_in_threadpool(record, request, caller, "printer.accept", name, machine=found.machine)
     return found
 
 
-def _checked(request: Request, name: str, *, accept: bool) -> PrinterCheck:
+async def _checked(request: Request, name: str, *, accept: bool) -> PrinterCheck:
+    limiter: CapacityLimiter = request.app.state.printer_checks
+    return await to_thread.run_sync(
+        lambda: _compared(request, name, accept=accept), limiter=limiter
+    )
+
+
+def _compared(request: Request, name: str, *, accept: bool) -> PrinterCheck:
     state = request.app.state
     printers: Mapping[str, Printer] = state.printers
     printer = printers.get(name)

@@ -27,7 +27,7 @@ from pydantic import ValidationError
 
 from stillpath.models.document import Document
 from stillpath.pipeline.files import replacing, sync
-from stillpath.service.instance_lock import exclusive
+from stillpath.service.instance_lock import RESTORING, exclusive, is_half_restored
 from stillpath.service.permissions import private_folder
 from stillpath.version import __version__
 
@@ -35,7 +35,6 @@ __all__ = ["BackupError", "Manifest", "back_up", "restore"]
 
 DATABASE = "stillpath.sqlite3"
 _MANIFEST = "backup.json"
-_RESTORING = ".restoring"
 _LOCK = "service.lock"
 _BACKUPS = "backups"
 """Folder in the data directory for backups on the same disk, from where they are fetched."""
@@ -92,7 +91,7 @@ def back_up(data_dir: Path, target: Path) -> Manifest:
                 f"{data_dir / _BACKUPS}"
             )
         private_folder(target.parent)
-    if (data_dir / _RESTORING).exists():
+    if is_half_restored(data_dir):
         raise BackupError(f"{data_dir}: a restore was broken off there; finish it first")
     with (
         replacing(target, mode=0o600) as temporary,
@@ -122,10 +121,15 @@ def restore(source: Path, data_dir: Path) -> Manifest:
         EBUSY if a service works with the directory.
     """
     with exclusive(data_dir):
-        fresh = data_dir / _RESTORING
-        if fresh.exists():  # whatever else is here came from a restore that was broken off
-            _clear(data_dir)
-        there = sorted(p.name for p in data_dir.iterdir() if p.name not in (_LOCK, _RESTORING))
+        fresh = data_dir / RESTORING
+        if fresh.exists():
+            if (data_dir / DATABASE).exists():  # moved in last: the rest may be used since
+                raise BackupError(
+                    f"{data_dir} has a database beside a restore that was broken off there; move "
+                    "it away, or name another folder with --data-dir"
+                )
+            _clear(data_dir)  # whatever else is here came from that restore
+        there = sorted(p.name for p in data_dir.iterdir() if p.name not in (_LOCK, RESTORING))
         if there:
             raise BackupError(
                 f"{data_dir} is not empty ({', '.join(there[:3])}); move it away, or name another "
@@ -330,13 +334,13 @@ def _is_inside(name: str) -> bool:
 
 def _clear(data_dir: Path) -> None:
     for path in data_dir.iterdir():
-        if path.name in (_LOCK, _RESTORING):
+        if path.name in (_LOCK, RESTORING):
             continue
         if path.is_dir():
             shutil.rmtree(path)
         else:
             path.unlink()
-    shutil.rmtree(data_dir / _RESTORING)  # last: until then we may begin anew
+    shutil.rmtree(data_dir / RESTORING)  # last: until then we may begin anew
 
 
 def _first_line(error: Exception) -> str:

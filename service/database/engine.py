@@ -28,6 +28,7 @@ from sqlalchemy.exc import TimeoutError as PoolTimeout
 from sqlalchemy.pool import NullPool
 
 from stillpath.service.database.migrations import LATEST
+from stillpath.service.instance_lock import is_half_restored
 from stillpath.service.permissions import private_file, private_folder
 from stillpath.service.storage.base import StorageError
 
@@ -127,6 +128,10 @@ def open_database(settings: Settings, *, pooled: bool = True) -> Engine:
     """
     url = database_url(settings)
     if url.get_backend_name() == "sqlite" and url.database:
+        if is_half_restored(Path(settings.data_dir)):
+            raise StoreError(
+                f"a restore into {settings.data_dir} was broken off; run stillpath restore again"
+            )
         if not _has_content(Path(url.database)):
             # Before SQLite deletes the log beside a database without content.
             _check_is_first_start(settings, url)

@@ -160,8 +160,10 @@ def what_started(printer: Printer, reply: Reply) -> str | None:
         told: Any = json.loads(reply.text)
     except ValueError:
         return None
-    begun = "print_started" if printer.kind == "moonraker" else "effectivePrint"
-    if not isinstance(told, dict) or told.get(begun, True) is True:
+    is_moonraker = printer.kind == "moonraker"
+    begun = "print_started" if is_moonraker else "effectivePrint"
+    # Of a file that is no .gcode Moonraker starts none and says nothing; old OctoPrints never do.
+    if not isinstance(told, dict) or told.get(begun, not is_moonraker) is True:
         return None
     if told.get("print_queued"):
         return "uploaded; the printer put it into its queue"

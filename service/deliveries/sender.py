@@ -25,7 +25,7 @@ from stillpath.service.deliveries.printers import Printer, printer_for, upload, 
 from stillpath.service.deliveries.rows import Delivery
 from stillpath.service.deliveries.targets import TargetRefused, check_webhook
 from stillpath.service.deliveries.webhooks import send_webhook
-from stillpath.service.jobs.state import Job
+from stillpath.service.jobs.state import START_WITHIN_S, Job
 from stillpath.service.jobs.store import JobStore
 from stillpath.service.settings import Settings
 from stillpath.service.storage.base import Storage, StorageError, sha256_of
@@ -61,7 +61,7 @@ class SendingTimes:
     attempts: int = 10
     claim_s: float = 60.0
     poll_s: float = 1.0
-    start_within_s: float = 3600.0
+    start_within_s: float = START_WITHIN_S
 
     def wait_s(self, attempts: int) -> float:
         """Return how long the next attempt waits after so many (1, 2, ...)."""
@@ -74,8 +74,8 @@ class Sender:
 
     Every process of the service may have one; a claim on the row decides who sends what. What
     cannot be delivered is tried again after 5 s, 15 s, 45 s, ... 6 h, ten times in all. A webhook
-    may arrive twice. An upload that shall start a print is never repeated unless it certainly did
-    not arrive: a second print could begin on top of the first.
+    may arrive twice. An upload that shall start a print is never repeated unless the printer was
+    not reached: a second print could begin on top of the first.
 
     Before a printer gets a file it is compared with the file's machine
     (`service.deliveries.checking`): what differs is noted, and where that makes a print unsafe, the
@@ -266,6 +266,10 @@ class Sender:
             begun = what_started(printer, reply) if starts else None
         if starts and reply.status >= 500:  # perhaps of a proxy that lost patience
             return "failed", _unknown(error or "")
+        if starts and state == "waiting":  # a busy printer: the retry would follow its print
+            return "failed", (
+                f"{error}; not tried again, because that would start a print later: send it again"
+            )
         if state == "done":
             told = begun
             if job.print_after and unsafe:

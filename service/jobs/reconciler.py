@@ -16,7 +16,7 @@ import structlog
 
 from stillpath.service.database.engine import DatabaseAway
 from stillpath.service.jobs.cluster import Cluster, ClusterAway
-from stillpath.service.jobs.state import Job, JobState, Lost
+from stillpath.service.jobs.state import START_WITHIN_S, Job, JobState, Lost
 from stillpath.service.jobs.store import JobStore
 from stillpath.service.jobs.sweep import Sweep
 from stillpath.service.settings import Settings
@@ -107,7 +107,7 @@ class Reconciler:
             if self._cluster.is_own:
                 for job, _ in self._in_flight.values():
                     self._give_back(job.id, job.attempt + 1, "the service stopped", blame=False)
-            self._store.release(_LEASE, self._holder)
+            self._store.release(_LEASE, self._holder, time.time())
         self._forget()
 
     def notify(self) -> None:
@@ -183,8 +183,17 @@ class Reconciler:
         """Take the lease, or renew it in good time."""
         now = time.monotonic()
         if not self._has_lease or now - self._leased_at > _RENEW_S:
+            self._hold_back_starts()
             self._has_lease = self._store.lease(_LEASE, self._holder, _LEASE_S, time.time())
             self._leased_at = now
+
+    def _hold_back_starts(self) -> None:
+        """After a long time without a service, start no print that nobody expects any more."""
+        latest = time.time() - START_WITHIN_S
+        if self._store.leased_until(_LEASE) < latest:
+            jobs = self._store.hold_back_starts(latest)
+            if jobs:
+                self._log.warning("prints will not be started: no service was running", jobs=jobs)
 
     def _take_over(self) -> None:
         """Requeue what ran when the previous service ended, together with its workers.
@@ -207,7 +216,9 @@ class Reconciler:
         if time.monotonic() - self._steady_since > timeout_s:
             for job in self._store.silent(time.time() - timeout_s):
                 reason = f"nothing was heard of its worker {job.worker} for {timeout_s:g} s"
-                self._give_back(job.id, job.attempt, reason)
+                # Our own workers end with their service: an earlier one began what we did not.
+                ended = self._cluster.is_own and job.id not in self._in_flight
+                self._give_back(job.id, job.attempt, reason, blame=not ended)
 
     def _collect(self) -> None:
         """Drop finished futures; a job that is still running then has lost its worker.

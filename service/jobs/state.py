@@ -23,6 +23,7 @@ from enum import StrEnum
 from typing import Any
 
 __all__ = [
+    "START_WITHIN_S",
     "WAITING_FOR_ROOM",
     "Cancelled",
     "Claimed",
@@ -39,6 +40,9 @@ __all__ = [
     "advance",
 ]
 
+START_WITHIN_S = 3600.0
+"""How long after its job was done, or while no service worked on it, a print may still start:
+later nobody may be there to watch."""
 WAITING_FOR_ROOM = "waiting for room on the disk"
 """Stage of a requeued job whose files had no room."""
 

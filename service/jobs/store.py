@@ -322,6 +322,11 @@ class JobStore:
         heard = func.coalesce(_JOBS.heartbeat_at, _JOBS.started_at, 0.0)
         return self._jobs(select(tables.jobs).where(_JOBS.state == "running", heard < before))
 
+    def hold_back_starts(self, before: float) -> int:
+        """Let unfinished jobs that were submitted before a time start no printer; count them."""
+        waits = (_JOBS.state.not_in(OVER), _JOBS.print_after, _JOBS.created_at < before)
+        return self._count(update(tables.jobs).where(*waits).values(print_after=False))
+
     # Deleting
 
     def forget(self, job_id: str) -> bool:
@@ -357,10 +362,18 @@ class JobStore:
             ).returning(leases.holder)
             return connection.execute(taken).first() is not None
 
-    def release(self, name: str, holder: str) -> None:
+    def release(self, name: str, holder: str, now: float) -> None:
         """Give a lease back, if `holder` has it."""
         leases = tables.leases.c
-        self._count(delete(tables.leases).where(leases.name == name, leases.holder == holder))
+        mine = (leases.name == name, leases.holder == holder, leases.expires_at > now)
+        self._count(update(tables.leases).where(*mine).values(expires_at=now))
+
+    def leased_until(self, name: str) -> float:
+        """Return when a lease ends or ended, in seconds since the epoch; 0: nobody had it."""
+        leases = tables.leases.c
+        with reading(self.engine) as connection:
+            query = select(leases.expires_at).where(leases.name == name)
+            return float(connection.execute(query).scalar() or 0.0)
 
     # Private
 

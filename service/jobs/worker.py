@@ -221,12 +221,13 @@ def _attempt(
             return OutOfRoom(job.attempt, time.time())  # not even for its folder
         _log_crash()
         if isinstance(error, StorageError):
-            # Another worker, or a later attempt, may succeed.
+            # Another worker, or a later attempt, may succeed; while nothing is stored, it waits.
             return Lost(
                 job.attempt,
                 time.time(),
                 str(error),
                 workplace.settings.max_attempts,
+                blame=_answers(workplace.storage),
                 problem=storage_away(error),
             )
         return Failed(job.attempt, time.time(), problem_of(error, job.kind))
@@ -235,6 +236,13 @@ def _attempt(
         if found["status"] >= 500:
             _log_crash()
         return Failed(job.attempt, time.time(), found)
+
+
+def _answers(storage: Storage) -> bool:
+    with contextlib.suppress(StorageError):
+        storage.check()
+        return True
+    return False
 
 
 def _no_room(job: Job, workplace: Workplace) -> Event:

@@ -105,11 +105,11 @@ class AuditLog:
             tell(row)
 
     def denied(self, caller: Caller, route: str, why: str) -> None:
-        """Record a refused request, at most once a minute per address and reason.
+        """Record a refused request, at most once a minute per network and reason.
 
         Without that limit anyone could fill the disk.
         """
-        what = (caller.remote, caller.key_id, why)
+        what = (caller.network, caller.key_id, why)
         now = time.time()
         with self._lock:
             if now - self._denied.get(what, 0.0) < _DENIED_SECONDS:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -43,6 +44,20 @@ class Caller:
     def sees(self) -> str | None:
         """Owner whose jobs the caller sees; None: everybody's."""
         return None if Scope.ADMIN in self.scopes else self.owner
+
+    @property
+    def network(self) -> str:
+        """The address; of IPv6 the network, because one computer has all of it."""
+        try:
+            address = ipaddress.ip_address(self.remote or "")
+        except ValueError:
+            return self.remote or "unknown"
+        if isinstance(address, ipaddress.IPv6Address):
+            mapped = address.ipv4_mapped
+            if mapped is not None:
+                return str(mapped)
+            return str(ipaddress.ip_network((address, 64), strict=False))
+        return str(address)
 
 
 LOCAL = Caller("local", frozenset(Scope))

@@ -30,13 +30,16 @@ class LocalStorage:
     Parameters
     ----------
     root : Path
-        Made if it does not exist.
+        With the folder `.fresh` in it. A disk that is away leaves an empty folder without it: then
+        every method raises `StorageError`, and nothing is written to another disk.
+    make : bool
+        Make both if they do not exist.
     """
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self, root: Path, *, make: bool = True) -> None:
         self._root = root
         with _explained():
-            for folder in _make_folder(root / _FRESH):
+            for folder in _make_folder(root / _FRESH) if make else ():
                 sync(folder)
             delete_leftovers(root / _FRESH, "*")
 
@@ -52,7 +55,7 @@ class LocalStorage:
         """
         targets = {self._path(key): file for key, file in files.items()}
         changed: set[Path] = set()
-        with _explained():
+        with self._there():
             for file in targets.values():
                 sync(file)
             for target, file in targets.items():
@@ -69,17 +72,19 @@ class LocalStorage:
     @contextlib.contextmanager
     def local(self, key: str) -> Iterator[Path]:
         """Give the file of `key` itself; see `Storage.local`."""
-        yield self._file(key)
+        with self._there():
+            file = self._file(key)
+        yield file
 
     def stat(self, key: str) -> Stat:
         """Return what is known of a file; see `Storage.stat`."""
-        with _explained():
+        with self._there():
             status = self._file(key).stat()
         return Stat(key, status.st_size, status.st_mtime)
 
     def read(self, key: str, start: int, stop: int) -> Iterator[bytes]:
         """Yield the bytes from `start` up to `stop`; see `Storage.read`."""
-        with _explained(), self._file(key).open("rb") as file:
+        with self._there(), self._file(key).open("rb") as file:
             file.seek(start)
             while start < stop and (chunk := file.read(min(_CHUNK_BYTES, stop - start))):
                 start += len(chunk)
@@ -88,6 +93,8 @@ class LocalStorage:
     def list(self, prefix: str) -> Iterator[Stat]:
         """Yield the files below `prefix`; see `Storage.list`."""
         check_prefix(prefix)
+        with self._there():
+            pass
         for folder, _, names in os.walk(self._root / prefix):
             for name in names:
                 path = Path(folder, name)
@@ -99,21 +106,30 @@ class LocalStorage:
     def delete(self, prefix: str) -> None:
         """Delete the files below `prefix`; see `Storage.delete`."""
         check_prefix(prefix)
-        with _explained(), contextlib.suppress(FileNotFoundError, NotADirectoryError):
+        with self._there(), contextlib.suppress(FileNotFoundError, NotADirectoryError):
             shutil.rmtree(self._root / prefix)
 
     def room(self) -> Room:
         """Return how much room the folder's disk has; see `Storage.room`."""
-        with _explained():
+        with self._there():
             usage = shutil.disk_usage(self._root)
         return Room(usage.free, usage.total)
 
     def check(self) -> None:
         """Write a file of some kB and delete it; see `Storage.check`."""
-        with _explained(), tempfile.TemporaryFile(dir=self._root / _FRESH) as file:
+        with self._there(), tempfile.TemporaryFile(dir=self._root / _FRESH) as file:
             file.write(_PROBE)
             file.flush()
             os.fsync(file.fileno())
+
+    @contextlib.contextmanager
+    def _there(self) -> Iterator[None]:
+        """Refuse if the root is not there, and explain disk errors."""
+        if not (self._root / _FRESH).is_dir():
+            why = f"the storage is not there (no folder {_FRESH}); is its disk mounted?"
+            raise StorageError(errno.EIO, why, str(self._root))
+        with _explained():
+            yield
 
     def _path(self, key: str) -> Path:
         check_key(key)

@@ -23,6 +23,7 @@ from stillpath.applications.machines.revision import (
     Conflict,
     NotApproved,
     UnknownMachine,
+    identified_from,
     source_file,
 )
 from stillpath.applications.machines.settings import user_data_dir
@@ -61,6 +62,19 @@ def any_store(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Machin
 
 def files_of(store_root: Path) -> list[str]:
     return sorted(str(p.relative_to(store_root)) for p in store_root.rglob("*") if p.is_file())
+
+
+@pytest.mark.parametrize("count", [1, 8, 40])
+def test_a_revision_may_come_of_many_files_with_any_names(store: MachineStore, count: int):
+    """Of an identification that took minutes: it must not be thrown away for its message."""
+    sources = [source_file(f"{k}\x01\n" + "x" * 240, b"") for k in range(count)]
+    message = identified_from(sources)
+    made = store.add_revision(
+        "mine", make_machine(), author="anna", message=message, sources=sources
+    )
+    assert made.message.startswith("identified from 0??xxx")
+    assert made.message.endswith(" and 32 more") == (count == 40)
+    assert len(made.sources) == count
 
 
 def test_a_revision_remembers_who_when_why_and_from_what(any_store: MachineStore):

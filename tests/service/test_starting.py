@@ -7,10 +7,12 @@ import signal
 import socket
 import subprocess
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import psutil
 import pytest
 
+from stillpath.service import server
 from stillpath.service.server import serve_forever
 from stillpath.service.settings import Settings
 from tests.service.test_server import REAL, ROOT
@@ -59,6 +61,20 @@ def test_a_taken_port_is_named_with_the_remedy(tmp_path: Path):
 
 
 @pytest.mark.skipif(os.name != "posix", reason="sends signals")
+@pytest.mark.parametrize("dual", [True, False])
+@pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0", "::1", "::"])
+def test_the_address_that_is_named_first_answers(
+    monkeypatch: pytest.MonkeyPatch, host: str, dual: bool
+):
+    if not socket.has_ipv6 and ":" in host:
+        pytest.skip("no IPv6")
+    if not dual:
+        monkeypatch.setattr(socket, "has_dualstack_ipv6", lambda: False)
+    with server._listening(host, 0) as listener:
+        first = urlsplit(server._addresses(host, listener.getsockname()[1])[0])
+        socket.create_connection((first.hostname, first.port), timeout=60).close()
+
+
 def test_a_service_ends_before_its_workers_are_up(tmp_path: Path):
     process = start(tmp_path)
     assert process.stdout is not None

@@ -91,6 +91,27 @@ def test_the_machine_is_found_by_typing_and_remembered(visitor: Visitor):
     expect(field).to_have_value(chosen)
 
 
+def test_a_finger_scrolls_the_machines_and_chooses_by_tapping(visitor: Visitor):
+    page = visitor.open(viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True)
+    field = page.get_by_role("combobox", name="Machine")
+    field.tap()
+    options = page.get_by_role("listbox")
+    before, first = field.input_value(), options.get_by_role("option").nth(2)
+    place = first.bounding_box()
+    assert place is not None
+    x, y = place["x"] + 40, place["y"] + place["height"] / 2
+    touch = page.context.new_cdp_session(page)
+    for kind, at in [("touchStart", y), *[("touchMove", y - k) for k in range(5, 120, 5)]]:
+        touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": [{"x": x, "y": at}]})
+    touch.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+    expect(options).to_be_visible()
+    assert options.evaluate("list => list.scrollTop") > 0
+    assert field.input_value() == before
+    options.get_by_role("option").nth(5).tap()
+    expect(options).to_be_hidden()
+    assert field.input_value() != before
+
+
 def test_a_file_that_is_no_gcode_is_refused_with_the_reason(visitor: Visitor, tmp_path: Path):
     file = tmp_path / "photo.gcode"
     file.write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(range(256)) * 40)
@@ -212,6 +233,28 @@ def test_list_page_and_report_say_the_same(
         # Nothing was compensated, and nothing says so.
         expect(page.get_by_role("columnheader", name="as written").first).to_be_visible()
         expect(page.locator("main")).to_contain_text("no piece of the file was to be compensated")
+
+
+def test_a_job_says_what_became_of_its_delivery(visitor: Visitor, gear: dict[str, Any]):
+    """Done is not started: the printer may have refused it."""
+    sending = {"kind": "printer", "target": "left", "state": "sending", "attempts": 1}
+    refused = sending | {"state": "failed", "error": "File is loaded; send it again"}
+    after = iter([sending | {"error": None}, refused])
+
+    def answer(route: Route) -> None:
+        job = gear | {"printer": "left", "print": True}
+        job["deliveries"] = [next(after) | {"next_at": None}] if shown else []
+        shown.append(job)
+        route.fulfill(body=json.dumps(job), content_type="application/json")
+
+    shown: list[Any] = []
+    page = visitor.open("#/")
+    page.route(re.compile(rf"/v1/jobs/{gear['id']}$"), answer)
+    page.goto(f"{visitor.url}/#/jobs/{gear['id']}")
+    sent = page.get_by_role("list", name="Sent on")
+    expect(sent).to_have_text("Sending to the printer left failed: File is loaded; send it again")
+    expect(page.locator(".headline")).to_be_visible()
+    assert len(shown) == 3
 
 
 def test_a_job_that_is_not_there(visitor: Visitor):

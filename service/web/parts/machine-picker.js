@@ -15,7 +15,11 @@ import { fill, h } from "../lib/dom.js";
  */
 export function machinePicker(machines, chosen, onChoose) {
   const usable = machines.filter((m) => m.problem === null);
-  const list = h("ul.options", { role: "listbox", id: "machine-options", "aria-label": "Machines", hidden: true });
+  const list = h("ul.options", {
+    role: "listbox", id: "machine-options", "aria-label": "Machines", hidden: true,
+    // The field keeps the focus. Not `onpointerdown`: a finger may mean to scroll.
+    onmousedown: (/** @type {Event} */ event) => event.preventDefault(),
+  });
   const input = h("input", {
     type: "text", id: "machine", role: "combobox", autocomplete: "off", spellcheck: "false",
     placeholder: "Type to search", "aria-autocomplete": "list", "aria-expanded": "false",
@@ -38,10 +42,7 @@ export function machinePicker(machines, chosen, onChoose) {
   const draw = () => {
     fill(list, shown.map((m, k) => h("li", {
       role: "option", id: `machine-option-${k}`, "aria-selected": String(k === active),
-      onpointerdown: (/** @type {Event} */ event) => {
-        event.preventDefault(); // the field keeps the focus
-        choose(m);
-      },
+      onclick: () => choose(m),
     }, h("span", null, m.title), h("small", null, `${m.name} · ${m.origin}`))),
     shown.length ? null : h("li.none", { role: "option", "aria-selected": "false", "aria-disabled": "true" }, "No machine has this in its name."));
     if (active >= 0 && shown.length) {

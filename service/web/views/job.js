@@ -8,6 +8,7 @@ import { bytes, when } from "../lib/format.js";
 import { problemPanel } from "../lib/problem.js";
 import { isOver, watchJob } from "../lib/watch.js";
 import { stateBadge } from "../parts/state.js";
+import { showDeliveries } from "../job/deliveries.js";
 import { downloads } from "../job/downloads.js";
 import { progressPanel } from "../job/progress.js";
 import { reportSections } from "../job/report.js";
@@ -19,11 +20,12 @@ export async function show({ main, signal, setTitle, params: [id] }) {
   const badge = h("span");
   const actions = h("div.actions");
   const body = h("div");
+  const sent = h("div");
   const fault = h("div");
   fill(main,
     h("p.crumb", null, h("a", { href: "#/jobs" }, "Jobs"), " / "),
     h("div.head", null, h("h1", null, first.source_name), badge),
-    h("p.lead", null, subtitle(first)), actions, fault, body);
+    h("p.lead", null, subtitle(first)), actions, fault, sent, body);
   const progress = progressPanel();
   let state = "";
 
@@ -34,6 +36,7 @@ export async function show({ main, signal, setTitle, params: [id] }) {
     state = job.state;
     fill(badge, stateBadge(state));
     fill(actions, isOver(job) ? deleteButton(job) : cancelButton(job));
+    if (isOver(job)) showDeliveries(sent, job, signal);
     if (!isOver(job)) fill(body, progress.element);
     else if (state === "done") finished(job);
     else if (state === "failed") fill(body, problemPanel(job.error, again()));

@@ -17,7 +17,7 @@ from sqlalchemy import Engine
 from stillpath.cli.main import run
 from stillpath.service.backup import archive
 from stillpath.service.backup.archive import BackupError, back_up, restore
-from stillpath.service.database.engine import open_database
+from stillpath.service.database.engine import StoreError, open_database
 from stillpath.service.deliveries.rows import deliveries_of
 from stillpath.service.instance_lock import exclusive
 from stillpath.service.jobs.state import JobKind, JobState
@@ -265,10 +265,24 @@ def test_a_restore_that_was_killed_begins_anew(step, store, data, tmp_path, monk
         except Killed:
             assert step < 3
     if step < 3:
+        with pytest.raises(StoreError, match="run stillpath restore again"):
+            jobs(new)
         restore(tmp_path / "b.tar", new)
     assert tree(new) == tree(data)
     assert len(jobs(new)) == 1
     assert not (new / ".restoring").exists()
+
+
+def test_a_restore_clears_no_database_that_was_made_since(store, data, tmp_path):
+    """As by a service that was started after a restore was broken off."""
+    back_up(data, tmp_path / "b.tar")
+    new = tmp_path / "new"
+    open_database(Settings(data_dir=new)).dispose()
+    write(new / ".restoring/machines/mine/1.json", "{}")
+    before = tree(new)
+    with pytest.raises(BackupError, match="move it away"):
+        restore(tmp_path / "b.tar", new)
+    assert tree(new) == before
 
 
 def test_backups_in_the_data_directory_are_not_in_the_next_one(store, data, tmp_path):

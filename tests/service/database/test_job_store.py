@@ -417,9 +417,10 @@ def test_a_lease(store: JobStore):
     assert not store.lease("reconciler", "two", 5.0, 1009.8)
     assert store.lease("reconciler", "two", 5.0, 1009.9)
     assert not store.lease("reconciler", "one", 5.0, 1010.0)
-    store.release("reconciler", "one")
+    store.release("reconciler", "one", 1010.0)
     assert not store.lease("reconciler", "one", 5.0, 1010.0)
-    store.release("reconciler", "two")
+    store.release("reconciler", "two", 1010.0)
+    assert store.leased_until("reconciler") == 1010.0
     assert store.lease("reconciler", "one", 5.0, 1010.0)
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +16,19 @@ from stillpath.applications.machines.documents import DocumentFolder
 from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine
 from stillpath.service.api import create_app
+from stillpath.service.api.printers import CHECKED_AT_ONCE
 from stillpath.service.deliveries.checking import Checker, PrinterUnknown
 from stillpath.service.deliveries.printers import Printer
 from stillpath.service.settings import Settings
-from tests.service.deliveries.listeners import Listener, moonraker, octoprint, until, uploads
+from tests.service.at_once import at_once
+from tests.service.deliveries.listeners import (
+    Listener,
+    Seen,
+    moonraker,
+    octoprint,
+    until,
+    uploads,
+)
 from tests.service.deliveries.places import Place, open_place
 from tests.service.deliveries.recorded_printer import status_of
 from tests.service.runners import pretend
@@ -393,6 +404,29 @@ def test_over_http_and_in_the_report(tmp_path: Path):
             assert client.get("/v1/printers/left/check").json()["findings"] == []
             for name, code in (("nobody", 404), ("octo", 422)):
                 assert client.get(f"/v1/printers/{name}/check").status_code == code
+
+
+def test_printers_that_do_not_answer_hold_few_threads(tmp_path: Path):
+    """All requests share the threads: a printer that hangs would stop the service."""
+    held, most, lock = 0, 0, threading.Lock()
+
+    def slowly(_: Seen):
+        nonlocal held, most
+        with lock:
+            held += 1
+            most = max(most, held)
+        time.sleep(0.5)
+        with lock:
+            held -= 1
+        return 503, {}, b"{}"
+
+    with Listener(slowly) as server:
+        settings = Settings(data_dir=tmp_path / "data", printers=printers_file(tmp_path, server))
+        app = create_app(settings, runner=pretend)
+        with TestClient(app, base_url="http://localhost") as client:
+            answers = at_once(*[lambda: client.get("/v1/printers/left/check")] * 20)
+    assert {answer.status_code for answer in answers} == {424}
+    assert most <= CHECKED_AT_ONCE
 
 
 def _delivery(client: TestClient, job: dict[str, Any]) -> dict[str, Any]:

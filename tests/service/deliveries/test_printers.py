@@ -94,13 +94,41 @@ def test_a_wrong_key_is_told_and_not_repeated(tmp_path: Path):
     assert "wrong" not in (delivery.error or "")
 
 
-@pytest.mark.parametrize("kind", ["moonraker", "octoprint"])
+@pytest.mark.parametrize("kind", ["moonraker", "octoprint", "moonraker, no .gcode"])
 def test_a_printer_that_does_not_begin_is_told(tmp_path: Path, kind: str):
+    """Of files such as .bgcode, Moonraker says nothing about a print."""
+    kind, _, silent = kind.partition(", ")
     busy = moonraker if kind == "moonraker" else octoprint
-    with busy(key="k", can_print=False) as server:
+    with busy(key="k", can_print=False) if not silent else Listener(_stored) as server:
         _, delivery = delivered(tmp_path, server, kind, prints=True, api_key="k", start=True)
     assert delivery.state == "done"
     assert "did not begin" in (delivery.error or "")
+
+
+def _stored(_: Seen):
+    return 201, {}, b'{"item": {"path": "part.bgcode"}, "action": "create_file"}'
+
+
+@pytest.mark.parametrize(("kind", "status"), [("moonraker", 403), ("octoprint", 409)])
+@pytest.mark.parametrize("prints", [False, True])
+def test_a_start_that_a_busy_printer_refused_is_not_tried_again(
+    tmp_path: Path, kind: str, status: int, prints: bool
+):
+    """As while it prints a file of that name: the retry would start it once more."""
+
+    def refuses_once(_: Seen):
+        if len(uploads(server)) == 1:
+            return status, {}, b'{"error": "File is loaded, upload not permitted"}'
+        return _stored(_)
+
+    with Listener(refuses_once) as server:
+        _, delivery = delivered(tmp_path, server, kind, prints=prints, start=True)
+    if prints:
+        assert (delivery.state, len(uploads(server))) == ("failed", 1)
+        assert "upload not permitted" in (delivery.error or "")
+        assert "not tried again" in (delivery.error or "")
+    else:
+        assert (delivery.state, len(uploads(server))) == ("done", 2)
 
 
 def test_a_page_is_no_answer_of_a_printer(tmp_path: Path):

@@ -20,7 +20,7 @@ from stillpath.service.deliveries.targets import (
 from stillpath.service.settings import Settings
 
 
-def settings(*targets: str, secret: str | None = "s") -> Settings:
+def settings(*targets: str, secret: str | None = "s" * 16) -> Settings:
     return Settings(data_dir=Path("unused"), webhook_targets=list(targets), webhook_secret=secret)
 
 

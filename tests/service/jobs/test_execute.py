@@ -198,6 +198,17 @@ def test_a_storage_that_stays_away_is_the_reason_in_the_end(
     assert "memory" not in job.problem["detail"]
 
 
+def test_a_job_waits_for_a_disk_that_is_away(site: Site, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(worker, "_PATIENCE_S", 0.0)
+    job_id = site.submit("G1")
+    (site.data_dir / ".fresh").rename(site.data_dir / ".away")
+    for _ in range(3):
+        job = Bench(site).run(job_id)
+        assert (job.state, job.losses) == (JobState.QUEUED, 0)
+    (site.data_dir / ".away").rename(site.data_dir / ".fresh")
+    assert Bench(site).run(job_id).state is JobState.DONE
+
+
 def test_a_job_without_room_waits_in_the_queue(site: Site):
     broken = _Broken(site.storage, StorageError(28, "No space left", "/"), 1)
     job = Bench(site).run(site.submit("G1"), storage=broken)

@@ -84,6 +84,37 @@ def test_every_attempt_has_its_moment_of_grace(site: Site, monkeypatch: pytest.M
     assert site.get(job_id).losses == 1
 
 
+@pytest.mark.parametrize("own", [True, False])
+@pytest.mark.parametrize("ours", [True, False])
+def test_a_service_that_was_killed_is_no_loss_of_its_jobs(site: Site, own: bool, ours: bool):
+    """With PostgreSQL its jobs are found by silence; remote workers outlive a service."""
+    look = looking(site, Workers(is_own=own))
+    job_id = site.submit("G1")
+    look._tick()
+    site.store.apply(job_id, Claimed(time.time() - 3600.0, "w"))
+    if not ours:
+        look._forget()
+    look._steady_since -= 3600.0
+    look._tick()
+    job = site.get(job_id)
+    assert (job.state, job.losses) == (JobState.QUEUED, int(ours or not own))
+
+
+@pytest.mark.parametrize("away_h", [0.5, 72.0])
+@pytest.mark.parametrize("submitted_h", [0.0, 73.0])
+def test_a_print_is_not_started_days_after_it_was_expected(
+    site: Site, away_h: float, submitted_h: float
+):
+    """Somebody switches the computer on again: a queue that was honestly long goes on."""
+    now = time.time()
+    look = looking(site, Workers())
+    site.store.lease("reconciler", "the last service", 5.0, now - away_h * 3600)
+    created_at = now - submitted_h * 3600
+    job_id = site.submit("G1", printer="left", print_after=True, created_at=created_at)
+    look._tick()
+    assert site.get(job_id).print_after == (min(away_h, submitted_h) < 1.0)
+
+
 def test_a_job_waits_until_the_disk_of_the_storage_has_room(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

@@ -104,6 +104,16 @@ def test_who_was_turned_away_is_written_once_a_minute(client: TestClient):
     assert "zzz" not in str(rows)
 
 
+def test_a_whole_network_turned_away_fills_no_disk(client: TestClient):
+    for k in range(20):
+        other = TestClient(
+            client.app, base_url="http://localhost", client=(f"2001:db8:7::{k:x}", 50000)
+        )
+        assert other.get("/v1/jobs").status_code == 401
+    rows = audit(client, action="denied", limit=1000)
+    assert 1 <= len([row for row in rows if row["remote"].startswith("2001:db8:7:")]) <= 2
+
+
 def test_the_audit_log_has_pages(client: TestClient):
     for _ in range(5):
         client.post("/v1/keys", json=WISH, headers=ADMIN)

@@ -245,7 +245,7 @@ def test_a_bucket_that_is_not_there_is_an_error_of_the_storage(s3_address: str, 
         storage.check()
 
 
-def test_the_settings_choose(tmp_path: Path):
+def test_the_settings_choose(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     assert isinstance(open_storage(Settings(data_dir=tmp_path)), LocalStorage)
     address = f"http://127.0.0.1:{free_port()}"
     there = Settings(data_dir=tmp_path, storage_url=f"s3://b/p?endpoint={address}&region=eu-1")
@@ -253,9 +253,41 @@ def test_the_settings_choose(tmp_path: Path):
     folder = Settings(data_dir=tmp_path, storage_url=(tmp_path / "else").as_uri())
     open_storage(folder).check()
     assert (tmp_path / "else").is_dir()
-    for wrong in ("ftp://b", "s3://", "s3://b?what=1"):
+    monkeypatch.chdir(tmp_path)
+    for wrong in ("ftp://b", "s3://", "s3://b?what=1", "file:relative", "file:", "file://"):
         with pytest.raises(ValueError, match="s3://bucket"):
             open_storage(Settings(data_dir=tmp_path, storage_url=wrong))
+
+
+def test_a_disk_that_is_away_is_an_error_and_nothing_goes_to_another(tmp_path: Path):
+    """Its folder is empty then, or not there; the first start alone makes it."""
+    root, file = tmp_path / "usb", tmp_path / "file"
+    chosen = Settings(data_dir=tmp_path / "data", storage_url=root.as_uri())
+    put(open_storage(chosen), "jobs/a/b", b"x", tmp_path)
+    root.rename(tmp_path / "away")
+    storage = open_storage(chosen)
+    for mount_point in ("not there", "empty"):
+        if mount_point == "empty":
+            root.mkdir()
+        file.write_bytes(b"x")
+        for use in (
+            storage.check,
+            storage.room,
+            lambda: storage.stat("jobs/a/b"),
+            lambda: next(storage.read("jobs/a/b", 0, 1)),
+            lambda: list(storage.list("jobs/")),
+            lambda: storage.put("jobs/a/c", file),
+            lambda: storage.delete("jobs/a/"),
+            lambda: storage.local("jobs/a/b").__enter__(),
+        ):
+            with pytest.raises(StorageError, match="is its disk mounted"):
+                use()
+        assert file.exists()
+    root.rmdir()  # nothing is in it
+    (tmp_path / "away").rename(root)
+    assert content(storage, "jobs/a/b") == b"x"
+    elsewhere = chosen.model_copy(update={"storage_url": (tmp_path / "new").as_uri()})
+    open_storage(elsewhere).check()
 
 
 def test_what_a_kill_left_is_deleted_when_it_is_old(tmp_path: Path):

@@ -1,0 +1,56 @@
+"""What variables of the environment may hold."""
+
+from __future__ import annotations
+
+import pytest
+
+from stillpath.cli.own_machines import service_settings
+from stillpath.models.errors import ModelError
+
+
+@pytest.mark.parametrize(
+    ("text", "read"),
+    [
+        ("a.example", ["a.example"]),
+        ("a.example, b.example,", ["a.example", "b.example"]),
+        (' ["a.example", "b.example"]', ["a.example", "b.example"]),
+        ("*", ["*"]),
+        ("", []),
+    ],
+)
+def test_a_list_may_be_json_or_have_commas(
+    monkeypatch: pytest.MonkeyPatch, text: str, read: list[str]
+):
+    for name in ("ALLOWED_HOSTS", "WEBHOOK_TARGETS"):
+        monkeypatch.setenv(f"STILLPATH_{name}", text)
+    monkeypatch.setenv("STILLPATH_TRUSTED_PROXIES", "127.0.0.1,10.0.0.0/8")
+    settings = service_settings()
+    assert settings.allowed_hosts == settings.webhook_targets == read
+    assert settings.trusted_proxies == ["127.0.0.1/32", "10.0.0.0/8"]
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("ALLOWED_HOSTS", "['a']", 'write for instance a,b or ["a", "b"]'),
+        ("TRUSTED_PROXIES", "nginx", "is not an address or network"),
+        ("WEBHOOK_SECRET", "hunter2", "has 7 characters, which can be guessed; give 16 or more"),
+    ],
+)
+def test_what_cannot_be_meant_is_named(
+    monkeypatch: pytest.MonkeyPatch, name: str, text: str, said: str
+):
+    monkeypatch.setenv(f"STILLPATH_{name}", text)
+    with pytest.raises(ModelError) as caught:
+        service_settings()
+    assert str(caught.value).startswith(f"STILLPATH_{name}: ")
+    assert said in str(caught.value)
+    assert "hunter2" not in str(caught.value)
+
+
+def test_an_empty_secret_is_none(monkeypatch: pytest.MonkeyPatch):
+    """Compose passes on an empty variable: nothing is signed with a key that everybody knows."""
+    for name in ("WEBHOOK_SECRET", "FIRST_KEY"):
+        monkeypatch.setenv(f"STILLPATH_{name}", "")
+    settings = service_settings()
+    assert (settings.webhook_secret, settings.first_key) == (None, None)
