@@ -28,6 +28,7 @@ _APART_S = 2.0  # beyond the side lobes of one peak
 _LEAST_FRACTION = 0.95  # of the sweep, before a cut log is refused
 _LATEST_START_S = 0.6  # half a second, plus delays of sensor, plant and time stamps
 _LEAD_S = 0.5
+_UNSURE_S = 0.01  # of a start, where friction and a frame delay slow motion
 _TABLE_HZ = 200.0  # where Klipper ends a table
 _CROSS = 0.2  # of the power along the axis
 _LEAST_COSINE = 0.7  # 45 degrees: nearer to this axis than to another
@@ -113,10 +114,13 @@ def align(
 
     kept = (grid_s >= start_s - _LEAD_S) & (grid_s <= start_s + profile.duration_s)
     coupling = _coupling(log, accel[kept], direction, rate_hz, excitation)
+    # Klipper begins a log with the first move; before, the machine stood still.
+    lead_s = float(grid_s[0]) - (start_s - _LEAD_S)
+    rest = round(lead_s * rate_hz) if 0.0 < lead_s <= _LEAD_S + _UNSURE_S else 0
     return AlignedLog(
         rate_hz,
-        command[kept],
-        np.asarray(accel[kept] @ direction, np.float64),
+        np.pad(command[kept], (rest, 0)),
+        np.pad(np.asarray(accel[kept] @ direction, np.float64), (rest, 0)),
         start_s,
         f_reached_hz,
         direction,

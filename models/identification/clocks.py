@@ -28,16 +28,17 @@ from stillpath.models.plants import ParametricMembers, PlantSetSpec, PlantSpec, 
 
 __all__ = ["Lateness", "lateness", "timed"]
 
-_BAND, _LOWEST_HZ = (0.5, 1.6), 8.0
-"""Frequencies over that of the strongest response at which phases are compared. Friction delays
-slower motion, and noise hides faster."""
+_BANDS, _LOWEST_HZ = ((0.3, 0.5), (0.5, 0.8), (0.8, 1.2), (1.2, 1.6)), 8.0
+"""Frequencies over that of the strongest response in which phases are compared."""
+_ALIKE, _ALIKE_S = 3, 0.12e-3
+"""How many bands must show the same difference between the axes, and how closely. A wrong mode
+delays some of them only (docs/tried.md)."""
 _AGREE_S = 0.5e-3
 """Largest distance of a log from the median of its axis: alignment may miss by a whole swing."""
-_MOST_APART_S = 1.5e-3
-"""Largest plausible difference between the axes."""
+_LEAST_APART_S, _MOST_APART_S = 0.05e-3, 1.5e-3
+"""Differences between the axes that are clear and plausible."""
 _STOP_S = 0.03
 """Longest braking after the test, which is in the log too."""
-_TOLD_S = 0.05e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,13 +47,13 @@ class Lateness:
 
     Attributes
     ----------
-    late_s : float
-        Against a test that begins with the log. The sensor's delay is in it.
+    late_s : ndarray, shape (bands,)
+        Against a test that begins with the log, by band. The sensor's delay is in it.
     whole : bool
         Whether the log has the length of the test, so that it does begin with it.
     """
 
-    late_s: float
+    late_s: Array
     whole: bool
 
 
@@ -75,7 +76,7 @@ def lateness(
     began_s = float(log.time_s[0]) - 0.5 * interval_s
     beyond_s = float(log.time_s[-1] - log.time_s[0]) - regenerate(test).duration_s
     whole = -2.0 * interval_s <= beyond_s <= _STOP_S
-    return Lateness(started_s - began_s + _lag_s(response, plant), whole)
+    return Lateness(started_s - began_s + _lags_s(response, plant), whole)
 
 
 def timed(
@@ -91,24 +92,29 @@ def timed(
         len(logs) > 1 or logs[0].whole for logs in known.values()
     ):
         return dict(found)
-    x_s, y_s = (float(np.mean([one.late_s for one in known[axis]])) for axis in ("x", "y"))
-    later_s = abs(y_s - x_s)
-    if later_s > _MOST_APART_S:
+    x_s, y_s = (np.median([one.late_s for one in known[axis]], axis=0) for axis in ("x", "y"))
+    apart_s = _alike(y_s - x_s)
+    if apart_s is None or not _LEAST_APART_S <= abs(apart_s) <= _MOST_APART_S:
         return dict(found)
-    later: Axis = "y" if y_s > x_s else "x"
+    later_s = abs(apart_s)
+    later: Axis = "y" if apart_s > 0.0 else "x"
+    other = "X" if later == "y" else "Y"
     one = found[later]
-    notes = one.notes
-    if later_s >= _TOLD_S:
-        other = "X" if later == "y" else "Y"
-        note = f"by the clocks of the logs the axis follows {1e3 * later_s:.2f} ms later than "
-        notes = (*notes, f"{note}{other}: commands allow for it")
-    return {**found, later: replace(one, plants=_later(one.plants, later_s), notes=notes)}
+    note = (
+        f"by the clocks of the logs the axis follows {1e3 * later_s:.2f} ms later than {other}: "
+        "commands allow for it"
+    )
+    plants = _later(one.plants, later_s)
+    return {**found, later: replace(one, plants=plants, notes=(*one.notes, note))}
 
 
 def _agreeing(logs: Sequence[Lateness]) -> list[Lateness]:
     """Return the logs near their median; none if most are elsewhere."""
-    middle_s = float(np.median([one.late_s for one in logs])) if logs else 0.0
-    near = [one for one in logs if abs(one.late_s - middle_s) <= _AGREE_S]
+    if not logs:
+        return []
+    whole_s = np.array([np.median(one.late_s) for one in logs])
+    close = np.abs(whole_s - np.median(whole_s)) <= _AGREE_S
+    near = [one for one, is_near in zip(logs, close, strict=True) if is_near]
     return near if 2 * len(near) > len(logs) else []
 
 
@@ -122,13 +128,27 @@ def _later(plants: PlantSetSpec, delay_s: float) -> PlantSetSpec:
     return plants.model_copy(update={"nominal": nominal, "members": members})
 
 
-def _lag_s(response: FrequencyResponse, plant: PlantSpec) -> float:
-    """Return the delay that explains the phase of a response over that of a plant best."""
+def _alike(apart_s: Array) -> float | None:
+    """Return the mean of the bands whose values lie closest together; None if they differ."""
+    rising = np.sort(apart_s)
+    widths = rising[_ALIKE - 1 :] - rising[: len(rising) - _ALIKE + 1]
+    first = int(np.argmin(widths))
+    if not widths[first] <= _ALIKE_S:
+        return None
+    return float(rising[first : first + _ALIKE].mean())
+
+
+def _lags_s(response: FrequencyResponse, plant: PlantSpec) -> Array:
+    """Return the delay that explains best the phase of a response over that of a plant, by band."""
     own = frequency_response(plant, response.f_hz)
     peak_hz = float(response.f_hz[np.argmax(np.abs(own))])
-    low_hz, high_hz = max(_LOWEST_HZ, _BAND[0] * peak_hz), _BAND[1] * peak_hz
-    near = (response.f_hz >= low_hz) & (response.f_hz <= high_hz)
-    w: Array = 2.0 * np.pi * response.f_hz[near]
-    phase = np.unwrap(np.angle(response.response[near] / own[near]))
-    trust = response.coherence[near] ** 2
-    return float(-np.sum(trust * w * phase) / np.sum(trust * w * w))
+    w = 2.0 * np.pi * response.f_hz
+    phase = np.unwrap(np.angle(response.response / own))
+    lags = []
+    for low, high in _BANDS:
+        near = response.f_hz >= max(_LOWEST_HZ, low * peak_hz)
+        near &= response.f_hz <= high * peak_hz
+        weight = (response.coherence * w)[near] ** 2
+        total = float(np.sum(weight))
+        lags.append(-np.sum(weight * (phase / w)[near]) / total if total > 0.0 else np.nan)
+    return np.array(lags)
