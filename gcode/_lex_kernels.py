@@ -98,6 +98,7 @@ def recall(buf: Any, start: int, stop: int, f: Any, i: Any, rows: Any, tables: A
         elif what == MEMO_FEATURE:
             i[I_FEATURE] = value - 1
         elif what == MEMO_OBJECT:
+            kind = _HARMLESS if i[I_OBJECT] == value - 1 else _OBJECT
             i[I_OBJECT] = value - 1
         else:
             i[I_OBJECT] = value - 1

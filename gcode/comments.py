@@ -38,10 +38,12 @@ def note_comment(state: MachineState, command: Command) -> int:
         i[at.I_FEATURE] = number
         state.remember(command, at.MEMO_FEATURE, number + 1)
     elif kind == MarkKind.OBJECT:
-        number = state.objects.number(mark.text)
+        # Moonraker, OctoPrint's plugin and RepRapFirmware exclude objects by these comments, too.
+        number, before = state.objects.number(mark.text), int(i[at.I_OBJECT])
         state.settle()
         i[at.I_OBJECT] = number
         state.remember(command, at.MEMO_OBJECT, number + 1)
+        return state.event(EventKind.HARMLESS if number == before else EventKind.OBJECT)
     else:
         state.remember(command, at.MEMO_EVENT, int(EventKind.HARMLESS))
     return state.event(EventKind.HARMLESS)

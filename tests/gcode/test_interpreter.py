@@ -326,6 +326,7 @@ def test_marks(golden_machine: Machine) -> None:
         *["Perimeter"] * 3,
     ]
     assert block.moves.object_id.tolist() == [0, -1, -1, -1, 1]
+    assert kinds(block).count(EventKind.OBJECT) == 3
     assert interpreter.state.objects.names == ["A id:0 copy 0", "B C"]
     assert interpreter.state.tables.layer_z[:2].tolist() == [0.3, 0.5]
 
