@@ -222,6 +222,8 @@ def test_corpus_is_cut_whole(machine: Machine, shared_dir: Path, folder: str) ->
     [
         (";STILLPATH_OFF", "; STILLPATH_ON"),
         ("  ;  stillpath_off for this bridge", ";STILLPATH_ON; again"),
+        (";\tSTILLPATH_OFF", "; \t stillpath_on"),
+        (";\u00a0STILLPATH_OFF", ";\u2003STILLPATH_ON"),
     ],
 )
 def test_moves_between_off_and_on_stay_as_they_came(machine, off, on):
