@@ -45,6 +45,9 @@ def test_motion_is_modal_and_power_switches() -> None:
 def test_extruder_is_the_beam_where_there_is_no_other() -> None:
     found = read_hatches("G1 F600 X1 E1\nG1 X2\nG1 X3 E1.5\nG92 E0\nG1 X4 E0.1\nG1 X5 E0.1")
     assert found.beam.tolist() == [True, False, True, True, False]
+    relative = "G1 F600 X10 E.5\nG1 Y1 E.02\nG1 X0 E.5\nG1 X1 E-.5\n"
+    assert read_hatches("M83\nG90\n" + relative).beam.tolist() == [True, True, True, False]
+    assert read_hatches("G91\nM82\n" + relative).beam.tolist() == [True, False, True, False]
 
 
 def test_relative_inches_and_shifted_origin() -> None:
