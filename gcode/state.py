@@ -27,7 +27,7 @@ from stillpath.gcode._table_kernels import (
     settle,
     settle_limits,
 )
-from stillpath.gcode.dialect import Dialect
+from stillpath.gcode.dialect import Dialect, OriginRule
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.lexer import Command, extended_parameters
 from stillpath.gcode.types import OF_STATE, EventKind, Limits
@@ -196,9 +196,12 @@ class MachineState:
         f, i = self.f, self.i
         self.settle()
         f[at.F_LAST : at.F_LAST + 4] = f[at.F_TOOL : at.F_TOOL + 4]
+        # RepRapFirmware's workspaces outlast homing.
+        lasting = self.dialect.origin == OriginRule.POSITION
         for k in range(3):
             if axes >> k & 1:
-                f[at.F_BASE + k] = f[at.F_HOMING + k]
+                if not lasting:
+                    f[at.F_BASE + k] = f[at.F_HOMING + k]
                 if home_mm is not None:
                     f[at.F_LAST + k] = f[at.F_TOOL + k] = home_mm[k]
         i[at.I_ORIGIN_KNOWN] |= axes

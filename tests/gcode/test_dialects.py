@@ -151,6 +151,10 @@ CASES = {
         "G1 X3 Y4 F600\nG60 S1\nG1 X9 Y9\nG1 R1 X0 Y0.5\n",
         {"reprapfirmware": (3, 4.5, 0, 0)},
     ),
+    "homing leaves a workspace's origin": (
+        "G10 L2 P1 X10 Z2\nG1 X1 F600\nG28\nG1 X1\nG28 Z\nG1 X2 Z0\n",
+        {"reprapfirmware": (12, 0, 2, 0)},
+    ),
     "retraction and back": ("M83\nG1 X1 E1 F600\nG10\nG10\nG11\n", same(ALL, 1, 0, 0, 1)),
     "volumetric": (
         f"M83\nM200 D2\nG1 X1 E{math.pi} F600\n",
