@@ -209,6 +209,7 @@ def test_where_it_ends(case: str, name: str, read) -> None:
         ("EXCLUDE_OBJECT_DEFINE NAME=" + "a" * 300, "reprapfirmware", "aborts the print"),
         ("G1 X10 F600\nG2 I-5 P1", "marlin-2.0", "divides by zero"),
         ("G2 I5 P101", "marlin", "100"),
+        ("G60 S6", "reprapfirmware", "line 1: G60 S6 is refused.*places 0 to 5; use one"),
         ("G1 X5 F600\rG1 X9", "marlin", "line 1.* carriage return.*LF"),
         ("G28\nM106 S9\r\nM106 S0\r M82", "marlin", "line 3.* carriage return"),
         ("; fan\rM106 S9", "reprapfirmware", "carriage return"),
@@ -394,6 +395,11 @@ def test_meta_commands_are_barriers(read) -> None:
     assert block.events.kind.tolist() == [*3 * [unknown], *2 * [harmless], *2 * [unknown]]
     assert any("conditional" in text for text in interpreter.warnings)
     assert any("expression" in text for text in interpreter.warnings)
+
+
+def test_saved_places_are_as_many_as_the_firmware_has(read) -> None:
+    text = "".join(f"G60 S{slot}\n" for slot in range(300))
+    assert len(read(text, "marlin")[1].state.saved) == 256
 
 
 def test_hop(read) -> None:
