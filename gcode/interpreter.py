@@ -378,7 +378,7 @@ class Interpreter:
     def _several(self, commands: list[Command]) -> int:
         """Execute the commands of one line, which stays whole, so its moves are not replaced.
 
-        Nor may modes and limits that it sets be held back.
+        Nor may modes and limits that it sets be held back: they end a stream.
         """
         state, i = self.state, self.state.i
         before = state.f.copy(), i.copy()
@@ -403,7 +403,7 @@ class Interpreter:
         state.settle()
         if i[at.I_MOVES] > moves:
             state.rows.tiny[at.M_KNOWN, moves : int(i[at.I_MOVES])] &= KEPT
-        elif worst in (EventKind.MODE, EventKind.LIMITS):
+        if worst in (EventKind.MODE, EventKind.LIMITS):
             worst = EventKind.STATE
         if i[at.I_MOVES] == moves or worst >= EventKind.STOP:
             known = int(i[at.I_KNOWN])
