@@ -102,6 +102,10 @@ def test_a_firmware_that_executes_no_stream_is_told_at_once(capsys, tmp_path) ->
             '{"kind": "klipper", "shaper": {"type_y": "ei(.05)", "damping_y": 0.5}}',
             "firmware.shaper: damping_y is 0.5, and Klipper takes up to 0.4 for ei",
         ),
+        (
+            '{"kind": "marlin", "linear_advance_k_s": 45}',
+            "firmware.linear_advance_k_s: must be at most 10",
+        ),
         ('{"kind": "reprapfirmware", "shaper": {"type": "zv"}}', "firmware.shaper.type: "),
         ('{"kind": "reprapfirmware", "shaper": {"type": "custom"}}', "firmware.shaper.type: "),
     ],
