@@ -21,6 +21,7 @@ from stillpath.gcode._motion_kernels import move
 from stillpath.gcode._plain_kernels import decimal, line_end, may_be_mark, plain
 from stillpath.gcode._slots import (
     DONE,
+    F_UNIT_MM,
     FULL,
     GROW,
     HANDBACK,
@@ -84,6 +85,8 @@ def recall(buf: Any, start: int, stop: int, f: Any, i: Any, rows: Any, tables: A
     value = tables.memo_values[slot] % MEMO_STRIDE
     kind = _HARMLESS
     if what == MEMO_LIMITS:
+        if f[F_UNIT_MM] != 1.0:
+            return HANDBACK
         kind = _LIMITS
         recall_limits(value, f, i, rows, tables)
     elif what == MEMO_EVENT and value != _UNKNOWN:

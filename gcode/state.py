@@ -236,11 +236,12 @@ class MachineState:
         remember: bool = True,
         kind: EventKind = EventKind.LIMITS,
     ) -> int:
-        """Set limits by name, and remember that this line does."""
+        """Set limits by name, and remember that this line does so in millimetres."""
         row = np.full(len(self.limits_names), np.nan)
         for name, value in values.items():
             row[self.limits_names.index(name)] = value
         limits = self.f[at.F_LIMITS : at.F_LIMITS + len(row)]
+        remember = remember and self.f[at.F_UNIT_MM] == 1.0
         if remember and self.memo_limits < len(self.tables.memo_limits):
             self.tables.memo_limits[self.memo_limits] = row
             if self.remember(command, at.MEMO_LIMITS, self.memo_limits):

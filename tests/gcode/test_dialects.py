@@ -282,6 +282,22 @@ def test_limits(read) -> None:
     assert block.limits[block.events.limits_id[2]].jerk_x_mm_s == 10
 
 
+@pytest.mark.parametrize(
+    ("line", "field"),
+    [
+        ("M201 X20", "accel_x_mm_s2"),
+        ("M203 X20", "feedrate_x_mm_s"),
+        ("M204 P20", "print_accel_mm_s2"),
+        ("M205 S20", "min_feedrate_mm_s"),
+    ],
+)
+def test_repeated_limits_are_read_in_the_units_in_force(line: str, field: str, read) -> None:
+    for units in (("G21", "G20", "G21"), ("G20", "G21", "G20")):
+        block, _ = read("".join(f"{unit}\n{line}\n" for unit in units), "marlin")
+        found = [getattr(block.limits[k], field) for k in block.events.limits_id[1::2]]
+        assert found == pytest.approx([20 if unit == "G21" else 508 for unit in units])
+
+
 @pytest.mark.parametrize("name", ["marlin", "reprapfirmware", "klipper"])
 def test_repeated_lines_do_the_same_again(name: str, read) -> None:
     """The kernel remembers what a line did; the second time it goes the same way."""
