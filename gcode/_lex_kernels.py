@@ -136,7 +136,8 @@ def run(buf: Any, stop: int, f: Any, i: Any, w: Any, rows: Any, tables: Any) -> 
         # The command letter, after blanks and an N word.
         while buf[p] == 32 or buf[p] == 9 or buf[p] == 13:
             p += 1
-        if (buf[p] | 32) == 110 and (buf[p + 1] == 32 or 48 <= buf[p + 1] <= 57):
+        numbered = buf[p] == 78 or (buf[p] == 110 and i[I_FOLD_CASE] != 0)
+        if numbered and (buf[p + 1] == 32 or 48 <= buf[p + 1] <= 57):
             p += 1
             while buf[p] == 32 or 48 <= buf[p] <= 57:
                 p += 1

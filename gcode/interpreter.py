@@ -278,7 +278,7 @@ class Interpreter:
                 line=int(i[at.I_LINE]),
                 text=text,
             )
-        start = int(i[at.I_POS]) + _skipped(raw)
+        start = int(i[at.I_POS]) + _skipped(raw, b"Nn" if self.dialect.fold_case else b"N")
         end = int(i[at.I_END])
         state.span = (start, end - 1 if self._text[end - 1 : end] == b"\n" else end)
         commands = self._split(text)
@@ -450,12 +450,12 @@ _MESSAGES = {
 }
 
 
-def _skipped(raw: bytes) -> int:
+def _skipped(raw: bytes, letters: bytes) -> int:
     """Count the bytes before the command, as the kernel does: blanks and an N word."""
     k = 0
     while raw[k : k + 1] in (b" ", b"\t", b"\r"):
         k += 1
-    if raw[k : k + 1] in (b"N", b"n") and raw[k + 1 : k + 2] in _BLANK_OR_DIGIT:
+    if raw[k : k + 1] in letters and raw[k + 1 : k + 2] in _BLANK_OR_DIGIT:
         k += 1
         while raw[k : k + 1] in _BLANK_OR_DIGIT:
             k += 1

@@ -99,6 +99,13 @@ CASES = {
         "g1 x5 f600\n",
         {**same(("klipper", "reprapfirmware"), 5, 0, 0, 0), **same(FAMILY, 0, 0, 0, 0)},
     ),
+    "lower-case line number": (
+        "n5 G1 X5 F600\nn6 M204 P900\nn6 M204 P900\n",
+        {
+            **same(("klipper", "reprapfirmware", "marlin-loose"), 5, 0, 0, 0),
+            **same(FAMILY, 0, 0, 0, 0),
+        },
+    ),
     "leading zeros": (
         "G01 X5 F600\n",
         {"klipper": (0, 0, 0, 0), **same((*FAMILY, "reprapfirmware"), 5, 0, 0, 0)},
