@@ -32,6 +32,7 @@ _MOTION = frozenset({"G0", "G1", "G2", "G3", "G92"})
 _MOST_MOVES = 1_000_000
 _MOST_SAMPLES = 5_000_000
 _COMMENT = re.compile(r"\([^)]*(?:\)|$)")
+_LINE_END = re.compile(r"\r\n?|\n")
 _CODES = re.compile(r"(?<![A-Z_])([GM]) *0*(\d+)")
 
 
@@ -125,7 +126,7 @@ def read_hatches(text: str) -> Hatches:
         nothing.
     """
     reader = _Reader(text)
-    for number, line in enumerate(text.splitlines(), 1):
+    for number, line in enumerate(_LINE_END.split(text), 1):
         reader.take(number, line)
     return reader.hatches()
 

@@ -34,6 +34,15 @@ def test_beam_speed_and_lines() -> None:
     assert found.tracks().tolist() == [-1, 0, -1, 1]
 
 
+@pytest.mark.parametrize("odd", ["\u2028", "\x85", "\v", "\f"])
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+def test_lines_end_where_a_sender_ends_them(end: str, odd: str) -> None:
+    text = TWO.replace("to the first", f"to{odd}G1 X90").replace("\n", end)
+    found = read_hatches(text)
+    assert found.line.tolist() == [5, 7, 9, 11]
+    assert found.end_mm.tolist() == read_hatches(TWO).end_mm.tolist()
+
+
 def test_motion_is_modal_and_power_switches() -> None:
     """As senders write for GRBL: one G1, then bare words; S0 is a jump."""
     found = read_hatches("M4 S0\nG0X0Y0\nG1F600X1S10\nX2\nX3S0\nX4S10 (mark)\nM5")
