@@ -333,6 +333,7 @@ class Interpreter:
         if isinstance(word, Action):
             return self._classic(word, name, command)
         if isinstance(word, EventKind):
+            state.macro_ran = state.macro_ran or word == EventKind.UNKNOWN
             state.remember(command, at.MEMO_EVENT, int(word))
             return state.event(word)
         return word(state, command)

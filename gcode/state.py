@@ -104,6 +104,8 @@ class MachineState:
         self.retracted = False
         self.hop_mm = 0.0
         self.factors: dict[str, float] = {}
+        self.macro_ran = False
+        """The file has called what may be a macro of the printer."""
         self.tool_known = dialect.tool_at_start
         self.conditional_indent = -1
         self.warnings: dict[str, int] = {}
