@@ -221,6 +221,7 @@ def test_corpus_is_cut_whole(machine: Machine, shared_dir: Path, folder: str) ->
     ("off", "on"),
     [
         (";STILLPATH_OFF", "; STILLPATH_ON"),
+        ("; stillpath off", "; stillpath on"),
         ("  ;  stillpath_off for this bridge", ";STILLPATH_ON; again"),
         (";\tSTILLPATH_OFF", "; \t stillpath_on"),
         (";\u00a0STILLPATH_OFF", ";\u2003STILLPATH_ON"),
