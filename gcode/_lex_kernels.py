@@ -21,6 +21,7 @@ from stillpath.gcode._motion_kernels import move
 from stillpath.gcode._plain_kernels import decimal, line_end, may_be_mark, plain
 from stillpath.gcode._slots import (
     DONE,
+    F_UNIT_MM,
     FULL,
     GROW,
     HANDBACK,
@@ -43,6 +44,7 @@ from stillpath.gcode._slots import (
     I_N_MODAL,
     I_NEED,
     I_OBJECT,
+    I_OBJECTS,
     I_ODD_WORDS,
     I_ONE_COMMAND,
     I_PLAIN,
@@ -84,6 +86,8 @@ def recall(buf: Any, start: int, stop: int, f: Any, i: Any, rows: Any, tables: A
     value = tables.memo_values[slot] % MEMO_STRIDE
     kind = _HARMLESS
     if what == MEMO_LIMITS:
+        if f[F_UNIT_MM] != 1.0:
+            return HANDBACK
         kind = _LIMITS
         recall_limits(value, f, i, rows, tables)
     elif what == MEMO_EVENT and value != _UNKNOWN:
@@ -98,6 +102,8 @@ def recall(buf: Any, start: int, stop: int, f: Any, i: Any, rows: Any, tables: A
         elif what == MEMO_FEATURE:
             i[I_FEATURE] = value - 1
         elif what == MEMO_OBJECT:
+            changed = i[I_OBJECT] != value - 1 and i[I_OBJECTS] > 1
+            kind = _OBJECT if changed else _HARMLESS
             i[I_OBJECT] = value - 1
         else:
             i[I_OBJECT] = value - 1
@@ -132,7 +138,8 @@ def run(buf: Any, stop: int, f: Any, i: Any, w: Any, rows: Any, tables: Any) -> 
         # The command letter, after blanks and an N word.
         while buf[p] == 32 or buf[p] == 9 or buf[p] == 13:
             p += 1
-        if (buf[p] | 32) == 110 and (buf[p + 1] == 32 or 48 <= buf[p + 1] <= 57):
+        numbered = buf[p] == 78 or (buf[p] == 110 and i[I_FOLD_CASE] != 0)
+        if numbered and (buf[p + 1] == 32 or 48 <= buf[p + 1] <= 57):
             p += 1
             while buf[p] == 32 or 48 <= buf[p] <= 57:
                 p += 1

@@ -140,7 +140,8 @@ def decimal(buf: Any, p: int) -> Any:
 def may_be_mark(buf: Any, p: int) -> bool:
     """Return whether a comment (p: after its semicolon) may be one that `recall` knows."""
     c = byte_at(buf, p)
-    while c == 32 or c == 59:
+    # Users' marks may have a tab or a no-break space (two bytes) before them.
+    while c == 59 or c > 127 or (c <= 32 and c != 10):
         p += 1
         c = byte_at(buf, p)
     return bool(_MARKS[(c & 31) << 5 | byte_at(buf, p + 1) & 31])

@@ -77,6 +77,7 @@ I_FOLD_CASE = 42  # lower case is read
 I_ODD_WORDS = 43  # bit per letter: a move with that word is Python's
 I_HOLD = 44  # every command is Python's: it may not be carried out at all
 I_APART = 45  # not every move of the rows starts where the one before it ends
+I_OBJECTS = 46  # objects that were named so far
 I_SIZE = 48
 
 # Rows of the integer columns: of moves (M_) and of events (E_), each sort of number by itself.

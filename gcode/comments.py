@@ -38,10 +38,14 @@ def note_comment(state: MachineState, command: Command) -> int:
         i[at.I_FEATURE] = number
         state.remember(command, at.MEMO_FEATURE, number + 1)
     elif kind == MarkKind.OBJECT:
-        number = state.objects.number(mark.text)
+        # Moonraker, OctoPrint's plugin and RepRapFirmware exclude objects by these comments, too.
+        # A single object is cancelled with the print.
+        number, before = state.objects.number(mark.text), int(i[at.I_OBJECT])
         state.settle()
-        i[at.I_OBJECT] = number
+        i[at.I_OBJECT], i[at.I_OBJECTS] = number, len(state.objects.names)
         state.remember(command, at.MEMO_OBJECT, number + 1)
+        changed = number != before and i[at.I_OBJECTS] > 1
+        return state.event(EventKind.OBJECT if changed else EventKind.HARMLESS)
     else:
         state.remember(command, at.MEMO_EVENT, int(EventKind.HARMLESS))
     return state.event(EventKind.HARMLESS)

@@ -32,6 +32,7 @@ _MOTION = frozenset({"G0", "G1", "G2", "G3", "G92"})
 _MOST_MOVES = 1_000_000
 _MOST_SAMPLES = 5_000_000
 _COMMENT = re.compile(r"\([^)]*(?:\)|$)")
+_LINE_END = re.compile(r"\r\n?|\n")
 _CODES = re.compile(r"(?<![A-Z_])([GM]) *0*(\d+)")
 
 
@@ -125,7 +126,7 @@ def read_hatches(text: str) -> Hatches:
         nothing.
     """
     reader = _Reader(text)
-    for number, line in enumerate(text.splitlines(), 1):
+    for number, line in enumerate(_LINE_END.split(text), 1):
         reader.take(number, line)
     return reader.hatches()
 
@@ -171,6 +172,8 @@ class _Reader:
         codes = {letter + digits for letter, digits in _CODES.findall(text.upper())}
         self._laser = bool(codes & {"M3", "M4", "M5"})
         self._scale, self._absolute, self._jumping = 1.0, True, True
+        self._absolute_e: bool | None = None
+        """What M82 or M83 said last; None: neither, so E follows G90 and G91."""
         self._position = np.zeros(2)
         self._origin = np.zeros(2)
         self._speed, self._filament = 0.0, 0.0
@@ -211,6 +214,8 @@ class _Reader:
             self._scale = _INCH_MM if code == "G20" else 1.0
         elif code in ("G90", "G91"):
             self._absolute = code == "G90"
+        elif code in ("M82", "M83"):
+            self._absolute_e = code == "M82"
         elif code == "G92":
             self._shift(words, number, line)
         elif code in ("G2", "G3"):
@@ -273,7 +278,8 @@ class _Reader:
         if "E" not in words:
             return False
         value = _number(words, "E", number, line)
-        step = value - self._filament if self._absolute else value
+        absolute = self._absolute if self._absolute_e is None else self._absolute_e
+        step = value - self._filament if absolute else value
         self._filament += step
         return step > 0
 

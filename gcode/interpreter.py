@@ -278,7 +278,7 @@ class Interpreter:
                 line=int(i[at.I_LINE]),
                 text=text,
             )
-        start = int(i[at.I_POS]) + _skipped(raw)
+        start = int(i[at.I_POS]) + _skipped(raw, b"Nn" if self.dialect.fold_case else b"N")
         end = int(i[at.I_END])
         state.span = (start, end - 1 if self._text[end - 1 : end] == b"\n" else end)
         commands = self._split(text)
@@ -333,6 +333,7 @@ class Interpreter:
         if isinstance(word, Action):
             return self._classic(word, name, command)
         if isinstance(word, EventKind):
+            state.macro_ran = state.macro_ran or word == EventKind.UNKNOWN
             state.remember(command, at.MEMO_EVENT, int(word))
             return state.event(word)
         return word(state, command)
@@ -378,7 +379,7 @@ class Interpreter:
     def _several(self, commands: list[Command]) -> int:
         """Execute the commands of one line, which stays whole, so its moves are not replaced.
 
-        Nor may modes and limits that it sets be held back.
+        Nor may modes and limits that it sets be held back: they end a stream.
         """
         state, i = self.state, self.state.i
         before = state.f.copy(), i.copy()
@@ -403,7 +404,7 @@ class Interpreter:
         state.settle()
         if i[at.I_MOVES] > moves:
             state.rows.tiny[at.M_KNOWN, moves : int(i[at.I_MOVES])] &= KEPT
-        elif worst in (EventKind.MODE, EventKind.LIMITS):
+        if worst in (EventKind.MODE, EventKind.LIMITS):
             worst = EventKind.STATE
         if i[at.I_MOVES] == moves or worst >= EventKind.STOP:
             known = int(i[at.I_KNOWN])
@@ -450,12 +451,12 @@ _MESSAGES = {
 }
 
 
-def _skipped(raw: bytes) -> int:
+def _skipped(raw: bytes, letters: bytes) -> int:
     """Count the bytes before the command, as the kernel does: blanks and an N word."""
     k = 0
     while raw[k : k + 1] in (b" ", b"\t", b"\r"):
         k += 1
-    if raw[k : k + 1] in (b"N", b"n") and raw[k + 1 : k + 2] in _BLANK_OR_DIGIT:
+    if raw[k : k + 1] in letters and raw[k + 1 : k + 2] in _BLANK_OR_DIGIT:
         k += 1
         while raw[k : k + 1] in _BLANK_OR_DIGIT:
             k += 1

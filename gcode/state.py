@@ -27,7 +27,7 @@ from stillpath.gcode._table_kernels import (
     settle,
     settle_limits,
 )
-from stillpath.gcode.dialect import Dialect
+from stillpath.gcode.dialect import Dialect, OriginRule
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.lexer import Command, extended_parameters
 from stillpath.gcode.types import OF_STATE, EventKind, Limits
@@ -104,6 +104,8 @@ class MachineState:
         self.retracted = False
         self.hop_mm = 0.0
         self.factors: dict[str, float] = {}
+        self.macro_ran = False
+        """The file has called what may be a macro of the printer."""
         self.tool_known = dialect.tool_at_start
         self.conditional_indent = -1
         self.warnings: dict[str, int] = {}
@@ -196,9 +198,12 @@ class MachineState:
         f, i = self.f, self.i
         self.settle()
         f[at.F_LAST : at.F_LAST + 4] = f[at.F_TOOL : at.F_TOOL + 4]
+        # RepRapFirmware's workspaces outlast homing.
+        lasting = self.dialect.origin == OriginRule.POSITION
         for k in range(3):
             if axes >> k & 1:
-                f[at.F_BASE + k] = f[at.F_HOMING + k]
+                if not lasting:
+                    f[at.F_BASE + k] = f[at.F_HOMING + k]
                 if home_mm is not None:
                     f[at.F_LAST + k] = f[at.F_TOOL + k] = home_mm[k]
         i[at.I_ORIGIN_KNOWN] |= axes
@@ -233,11 +238,12 @@ class MachineState:
         remember: bool = True,
         kind: EventKind = EventKind.LIMITS,
     ) -> int:
-        """Set limits by name, and remember that this line does."""
+        """Set limits by name, and remember that this line does so in millimetres."""
         row = np.full(len(self.limits_names), np.nan)
         for name, value in values.items():
             row[self.limits_names.index(name)] = value
         limits = self.f[at.F_LIMITS : at.F_LIMITS + len(row)]
+        remember = remember and self.f[at.F_UNIT_MM] == 1.0
         if remember and self.memo_limits < len(self.tables.memo_limits):
             self.tables.memo_limits[self.memo_limits] = row
             if self.remember(command, at.MEMO_LIMITS, self.memo_limits):

@@ -50,7 +50,7 @@ class EventKind(IntEnum):
     """Leaves position or state unknown, or changes the place without motion (RepRapFirmware's G92):
     homing, probing, macros, tool change, pause."""
     OBJECT = 5
-    """Object-exclusion mark: the firmware may jump over what follows."""
+    """Object-exclusion mark, or a comment by which hosts exclude: what follows may be skipped."""
     SHAPER = 6
     """Sets the firmware's own input shaper (stops the motion)."""
     STAMP = 7

@@ -7,6 +7,8 @@ workspace at power-on).
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from stillpath.gcode import _slots as at
 from stillpath.gcode.lexer import Command, split_line
 from stillpath.gcode.state import MachineState, Saved
@@ -67,15 +69,21 @@ def machine_space(state: MachineState, command: Command) -> int:
 
 def save_place(state: MachineState, command: Command) -> int:
     """G60."""
-    slot = state.numbers(command, "S").get("S", 0.0)
-    state.saved[f"G60 {int(slot)}"] = Saved(state.f.copy(), state.i.copy())
+    slot = _slot(state.numbers(command, "S"))
+    if state.dialect.expressions and slot > _LAST_RESTORE_POINT:
+        raise state.problem(
+            f"G60 S{slot} is refused by {state.dialect.title}, which has places 0 to "
+            f"{_LAST_RESTORE_POINT}; use one of them",
+            command,
+        )
+    state.saved[f"G60 {slot}"] = Saved(state.f.copy(), state.i.copy())
     return state.event(EventKind.STATE)
 
 
 def move_to_saved(state: MachineState, command: Command) -> int:
     """G61 of Marlin: go back to X Y Z as they were, each as far off as its word says."""
     given = state.numbers(command, "SXYZF")
-    saved = state.saved.get(f"G60 {int(given.get('S', 0.0))}")
+    saved = state.saved.get(f"G60 {_slot(given)}")
     if saved is None:
         state.warn("nothing was saved with G60; the firmware passes G61 over")
         return state.event(EventKind.HARMLESS)
@@ -98,6 +106,13 @@ def move_to_saved(state: MachineState, command: Command) -> int:
 
 
 _NONE = (0.0, 0.0, 0.0)
+_LAST_RESTORE_POINT = 5
+"""RepRapFirmware's NumVisibleRestorePoints is 6."""
+
+
+def _slot(given: Mapping[str, float]) -> int:
+    """Return the number of a saved place, as Marlin limits it to a byte."""
+    return int(min(max(given.get("S", 0.0), 0.0), 255.0))
 
 
 def _shift(state: MachineState) -> tuple[float, float, float]:

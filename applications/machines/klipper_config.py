@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 from stillpath.gcode.firmware.klipper.dialect import FOREIGN
 from stillpath.models.errors import ModelError
+from stillpath.models.firmware.klipper import shaper_type
 from stillpath.models.user_files import read_bytes
 
 __all__ = [
@@ -270,6 +271,10 @@ def _shaper(config: PrinterConfig) -> list[Fact]:
     found = []
     for axis in "xy":
         kind = config.text(section, f"shaper_type_{axis}", common)
+        try:
+            kind = shaper_type(kind or "")
+        except ValueError as error:
+            raise ModelError(f"{config.name}: [{section}] shaper_type_{axis}: {error}") from None
         found.append(Fact(section, f"shaper_type_{axis}", f"{place}.type_{axis}", kind))
         found += _numbers(
             config,

@@ -64,10 +64,10 @@ _NUMBER = r"(?P<text>-?\d*\.?\d+)"
 _PATTERNS: tuple[tuple[re.Pattern[str], MarkKind], ...] = tuple(
     (re.compile(pattern), kind)
     for pattern, kind in (
-        (r"; ?stillpath\b|; Processed by stillpath ", MarkKind.STAMP),
         # Typed by users, so read leniently: a missed one would let protected moves be changed.
-        (r";\s*(?i:stillpath_off)\b", MarkKind.OFF),
-        (r";\s*(?i:stillpath_on)\b", MarkKind.ON),
+        (r";\s*(?i:stillpath[ _]off)\b", MarkKind.OFF),
+        (r";\s*(?i:stillpath[ _]on)\b", MarkKind.ON),
+        (r"; ?stillpath(?:| advise|, held back):|; Processed by stillpath ", MarkKind.STAMP),
         (r";LAYER_CHANGE\s*$", MarkKind.LAYER),  # PrusaSlicer, SuperSlicer, Orca, Creality
         (r"; CHANGE_LAYER\s*$", MarkKind.LAYER),  # Bambu
         (r";LAYER:-?\d+", MarkKind.LAYER),  # Cura, ideaMaker

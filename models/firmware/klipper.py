@@ -2,14 +2,42 @@
 
 from __future__ import annotations
 
+import re
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field, model_validator
 
 from stillpath.models.document import Document, NonNegative, Positive
 from stillpath.models.firmware.common import FirmwareFacts, Hotend
 
-__all__ = ["Extruder", "FirmwareShaper", "Klipper", "PlannerLimits"]
+__all__ = ["Extruder", "FirmwareShaper", "Klipper", "PlannerLimits", "shaper_type"]
+
+_MOST_DAMPING = {"zv": 0.99, "mzv": 0.99, "zvd": 0.99, "ei": 0.4, "2hump_ei": 0.3, "3hump_ei": 0.2}
+"""Klipper's shapers (klippy/extras/shaper_defs.py, 2026-08) and the damping that each takes."""
+_TYPE = re.compile(r"(\w+)(\([\w=.,]*\))?", re.ASCII)
+
+
+def shaper_type(text: str) -> str:
+    """Return a shaper's type as it is written in a line: lower case, without white space.
+
+    Since 2026 a type may have arguments: mzv(n=4,t=1.0).
+
+    Raises
+    ------
+    ValueError
+        If Klipper has no such shaper. The smoothers of Kalico (smooth_...) are taken as they are.
+    """
+    kind = "".join(text.split()).lower()
+    found = _TYPE.fullmatch(kind)
+    if found is None or not (found[1] in _MOST_DAMPING or found[1].startswith("smooth_")):
+        raise ValueError(
+            f"{text!r:.60} is no shaper of Klipper's; give {', '.join(_MOST_DAMPING)}, with its "
+            "arguments if it has any, such as mzv(n=4,t=1.0)"
+        )
+    return kind
+
+
+_Type = Annotated[str, AfterValidator(shaper_type)]
 
 
 class PlannerLimits(Document):
@@ -37,12 +65,26 @@ class Extruder(Hotend):
 class FirmwareShaper(Document):
     """The firmware's own input shaper as configured, to be restored after our moves."""
 
-    type_x: str = "mzv"
+    type_x: _Type = "mzv"
     freq_x_hz: NonNegative = 0.0
     damping_x: NonNegative = 0.1
-    type_y: str = "mzv"
+    type_y: _Type = "mzv"
     freq_y_hz: NonNegative = 0.0
     damping_y: NonNegative = 0.1
+
+    @model_validator(mode="after")
+    def _taken(self) -> FirmwareShaper:
+        for axis, kind, damping in (
+            ("x", self.type_x, self.damping_x),
+            ("y", self.type_y, self.damping_y),
+        ):
+            most = _MOST_DAMPING.get(kind.partition("(")[0], 1.0)
+            if damping > most:
+                raise ValueError(
+                    f"damping_{axis} is {damping:g}, and Klipper takes up to {most:g} for {kind}; "
+                    "state what printer.cfg says"
+                )
+        return self
 
 
 class Klipper(FirmwareFacts):

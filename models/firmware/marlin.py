@@ -113,8 +113,8 @@ class Marlin(FirmwareFacts):
     """LIN_ADVANCE, classic: K above 0 caps accelerations. None: not known; times are planned as
     without it, but a file that sets K is taken for one of a printer that has it: the stream's
     filament holds its advance, where that would not have lowered the accelerations."""
-    linear_advance_k_s: NonNegative = 0.0
-    """K at power-on (M900)."""
+    linear_advance_k_s: Annotated[float, Field(ge=0, le=10)] = 0.0
+    """K at power-on (M900), up to 10 as Marlin takes it."""
     min_arc_segment_mm: Positive = 0.1
     """MIN_ARC_SEGMENT_MM; the longest segment is `arc_resolution_mm` (MAX_ARC_SEGMENT_MM)."""
     min_circle_segments: Annotated[int, Field(ge=1)] = 72

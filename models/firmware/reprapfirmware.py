@@ -37,8 +37,8 @@ class RepRapExtruder(Hotend, Drive):
 class RepRapShaper(Document):
     """The firmware's own input shaper (M593), to be restored after our moves."""
 
-    type: Annotated[str, Field(pattern=r"^[a-z0-9]+$")] = "none"
-    """The P parameter: none, mzv, zvd, zvdd, zvddd, ei2, ei3."""
+    type: Literal["none", "mzv", "zvd", "zvdd", "zvddd", "ei2", "ei3"] = "none"
+    """The P parameter. One of P"custom" cannot be restored by its name, and is not supported."""
     freq_hz: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 40.0
     damping: Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False)] = 0.1
 

@@ -96,6 +96,18 @@ def test_a_firmware_that_executes_no_stream_is_told_at_once(capsys, tmp_path) ->
         ('{"kind": "grbl"}', "firmware: kind must be klipper, marlin or reprapfirmware"),
         ('{"kind": "marlin", "steps_per_mm": {"x": 0}}', "firmware.steps_per_mm.x: "),
         ('{"kind": "klipper", "planner": {"max_accel_mm_s2": -1}}', "firmware.planner.max_accel"),
+        ('{"kind": "klipper", "shaper": {"type_x": "foo"}}', "firmware.shaper.type_x: 'foo' is no"),
+        ('{"kind": "klipper", "shaper": {"type_y": "mzv\\nG28 ; "}}', "firmware.shaper.type_y: "),
+        (
+            '{"kind": "klipper", "shaper": {"type_y": "ei(.05)", "damping_y": 0.5}}',
+            "firmware.shaper: damping_y is 0.5, and Klipper takes up to 0.4 for ei",
+        ),
+        (
+            '{"kind": "marlin", "linear_advance_k_s": 45}',
+            "firmware.linear_advance_k_s: must be at most 10",
+        ),
+        ('{"kind": "reprapfirmware", "shaper": {"type": "zv"}}', "firmware.shaper.type: "),
+        ('{"kind": "reprapfirmware", "shaper": {"type": "custom"}}', "firmware.shaper.type: "),
     ],
 )
 def test_a_wrong_section_is_named(capsys, tmp_path, section: str, message: str) -> None:

@@ -286,6 +286,7 @@ def test_typed_in_resonances(store: MachineStore, config: Path):
         ("kinematics: corexy", "kinematics: delta", ["kinematics delta: only", "as sliced"]),
         ("[stepper_z]", "[stepper_q]", ["travel", "z"]),
         ("position_max: 250", "position_max: -9", ["travel", "-2.0", "-9.0"]),
+        ("type_x: ei", "type_x: foo", ["[input_shaper] shaper_type_x", "'foo'", "give zv, mzv"]),
     ],
 )
 def test_bad_configurations(store: MachineStore, config: Path, capsys, old, new, words):
@@ -310,6 +311,7 @@ def test_what_is_no_configuration(tmp_path: Path, capsys, content: bytes):
         ("max_accel = 4000", "max_accel = 5000", "[printer] max_accel: the printer has 5000, the"),
         ("advance = 0.04", "advance = 0.05", "[extruder] pressure_advance: the printer has 0.05"),
         ("freq_x = 61.2", "freq_x = 58", "[input_shaper] shaper_freq_x: the printer has 58, the"),
+        ("type_x: ei", "type_x: mzv (n=4, t=1.0)", "shaper_type_x: the printer has mzv(n=4,t=1.0)"),
         ("type_x: ei", "type_x: zv", "[input_shaper] shaper_type_x: the printer has zv, the mach"),
         ("kinematics: corexy", "kinematics: cartesian", "[printer] kinematics: the printer has c"),
         ("max_accel = 4000", "max_accel = 4000\nmax_accel_to_decel: 1000", "has 0.75, the machin"),

@@ -99,6 +99,13 @@ CASES = {
         "g1 x5 f600\n",
         {**same(("klipper", "reprapfirmware"), 5, 0, 0, 0), **same(FAMILY, 0, 0, 0, 0)},
     ),
+    "lower-case line number": (
+        "n5 G1 X5 F600\nn6 M204 P900\nn6 M204 P900\n",
+        {
+            **same(("klipper", "reprapfirmware", "marlin-loose"), 5, 0, 0, 0),
+            **same(FAMILY, 0, 0, 0, 0),
+        },
+    ),
     "leading zeros": (
         "G01 X5 F600\n",
         {"klipper": (0, 0, 0, 0), **same((*FAMILY, "reprapfirmware"), 5, 0, 0, 0)},
@@ -150,6 +157,10 @@ CASES = {
     "saved place of RepRapFirmware": (
         "G1 X3 Y4 F600\nG60 S1\nG1 X9 Y9\nG1 R1 X0 Y0.5\n",
         {"reprapfirmware": (3, 4.5, 0, 0)},
+    ),
+    "homing leaves a workspace's origin": (
+        "G10 L2 P1 X10 Z2\nG1 X1 F600\nG28\nG1 X1\nG28 Z\nG1 X2 Z0\n",
+        {"reprapfirmware": (12, 0, 2, 0)},
     ),
     "retraction and back": ("M83\nG1 X1 E1 F600\nG10\nG10\nG11\n", same(ALL, 1, 0, 0, 1)),
     "volumetric": (
@@ -205,6 +216,7 @@ def test_where_it_ends(case: str, name: str, read) -> None:
         ("EXCLUDE_OBJECT_DEFINE NAME=" + "a" * 300, "reprapfirmware", "aborts the print"),
         ("G1 X10 F600\nG2 I-5 P1", "marlin-2.0", "divides by zero"),
         ("G2 I5 P101", "marlin", "100"),
+        ("G60 S6", "reprapfirmware", "line 1: G60 S6 is refused.*places 0 to 5; use one"),
         ("G1 X5 F600\rG1 X9", "marlin", "line 1.* carriage return.*LF"),
         ("G28\nM106 S9\r\nM106 S0\r M82", "marlin", "line 3.* carriage return"),
         ("; fan\rM106 S9", "reprapfirmware", "carriage return"),
@@ -275,6 +287,22 @@ def test_limits(read) -> None:
     assert (after.speed_x_mm_s, after.min_speed_mm_s, after.jerk_policy) == (300, 1, 1)
     assert (after.jerk_x_mm_s, after.max_jerk_x_mm_s, after.print_accel_mm_s2) == (4, 10, 900)
     assert block.limits[block.events.limits_id[2]].jerk_x_mm_s == 10
+
+
+@pytest.mark.parametrize(
+    ("line", "field"),
+    [
+        ("M201 X20", "accel_x_mm_s2"),
+        ("M203 X20", "feedrate_x_mm_s"),
+        ("M204 P20", "print_accel_mm_s2"),
+        ("M205 S20", "min_feedrate_mm_s"),
+    ],
+)
+def test_repeated_limits_are_read_in_the_units_in_force(line: str, field: str, read) -> None:
+    for units in (("G21", "G20", "G21"), ("G20", "G21", "G20")):
+        block, _ = read("".join(f"{unit}\n{line}\n" for unit in units), "marlin")
+        found = [getattr(block.limits[k], field) for k in block.events.limits_id[1::2]]
+        assert found == pytest.approx([20 if unit == "G21" else 508 for unit in units])
 
 
 @pytest.mark.parametrize("name", ["marlin", "reprapfirmware", "klipper"])
@@ -390,6 +418,11 @@ def test_meta_commands_are_barriers(read) -> None:
     assert block.events.kind.tolist() == [*3 * [unknown], *2 * [harmless], *2 * [unknown]]
     assert any("conditional" in text for text in interpreter.warnings)
     assert any("expression" in text for text in interpreter.warnings)
+
+
+def test_saved_places_are_as_many_as_the_firmware_has(read) -> None:
+    text = "".join(f"G60 S{slot}\n" for slot in range(300))
+    assert len(read(text, "marlin")[1].state.saved) == 256
 
 
 def test_hop(read) -> None:

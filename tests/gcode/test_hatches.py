@@ -34,6 +34,15 @@ def test_beam_speed_and_lines() -> None:
     assert found.tracks().tolist() == [-1, 0, -1, 1]
 
 
+@pytest.mark.parametrize("odd", ["\u2028", "\x85", "\v", "\f"])
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+def test_lines_end_where_a_sender_ends_them(end: str, odd: str) -> None:
+    text = TWO.replace("to the first", f"to{odd}G1 X90").replace("\n", end)
+    found = read_hatches(text)
+    assert found.line.tolist() == [5, 7, 9, 11]
+    assert found.end_mm.tolist() == read_hatches(TWO).end_mm.tolist()
+
+
 def test_motion_is_modal_and_power_switches() -> None:
     """As senders write for GRBL: one G1, then bare words; S0 is a jump."""
     found = read_hatches("M4 S0\nG0X0Y0\nG1F600X1S10\nX2\nX3S0\nX4S10 (mark)\nM5")
@@ -45,6 +54,9 @@ def test_motion_is_modal_and_power_switches() -> None:
 def test_extruder_is_the_beam_where_there_is_no_other() -> None:
     found = read_hatches("G1 F600 X1 E1\nG1 X2\nG1 X3 E1.5\nG92 E0\nG1 X4 E0.1\nG1 X5 E0.1")
     assert found.beam.tolist() == [True, False, True, True, False]
+    relative = "G1 F600 X10 E.5\nG1 Y1 E.02\nG1 X0 E.5\nG1 X1 E-.5\n"
+    assert read_hatches("M83\nG90\n" + relative).beam.tolist() == [True, True, True, False]
+    assert read_hatches("G91\nM82\n" + relative).beam.tolist() == [True, False, True, False]
 
 
 def test_relative_inches_and_shifted_origin() -> None:

@@ -160,6 +160,19 @@ def test_refused(line: str, words: str, golden_machine: Machine) -> None:
     assert caught.value.text
 
 
+@pytest.mark.parametrize("macro", ["MY_MACRO", "T1"])
+def test_a_state_that_a_macro_may_have_saved(macro: str, wary_machine: Machine) -> None:
+    """It may have another origin; what is known is so again after homing."""
+    moves = "G1 X5 Y5 Z5 F600\nG1 X6\n"
+    text = f"G28\n{macro}\n{moves}RESTORE_GCODE_STATE NAME=s MOVE=1\n{moves}G28\n{moves}"
+    interpreter = Interpreter(wary_machine)
+    (block,) = interpreter.push(text.encode())
+    assert block.moves.known.tolist() == [0, 7, 0, 0, 0, 7]
+    assert kinds(block) == [EventKind.UNKNOWN] * 4
+    (warning,) = interpreter.warnings
+    assert warning.startswith("line 5: RESTORE_GCODE_STATE NAME=s: a macro may have saved it")
+
+
 def test_bounds_only_where_known(wary_machine: Machine) -> None:
     run("G91\nG1 X5000\n", wary_machine)
     with pytest.raises(GcodeError, match="X 5000"):
@@ -326,6 +339,7 @@ def test_marks(golden_machine: Machine) -> None:
         *["Perimeter"] * 3,
     ]
     assert block.moves.object_id.tolist() == [0, -1, -1, -1, 1]
+    assert kinds(block).count(EventKind.OBJECT) == 1
     assert interpreter.state.objects.names == ["A id:0 copy 0", "B C"]
     assert interpreter.state.tables.layer_z[:2].tolist() == [0.3, 0.5]
 

@@ -20,7 +20,7 @@ from stillpath.gcode.types import EventKind
 from stillpath.models.machine import AxisTravel, Machine
 from stillpath.models.store import load_machine
 from tests.fuzz.machines import machine_of
-from tests.gcode.cutting import HEAD, cut, pieces_of
+from tests.gcode.cutting import HEAD, cut, ender3_with, pieces_of
 from tests.gcode.prints import made_up_print, polygon
 
 
@@ -87,18 +87,42 @@ def test_method_none(machine: Machine) -> None:
     assert not any(isinstance(item, Piece) for item in items)
 
 
-def test_object_marks(machine: Machine) -> None:
-    """A mark ends a piece, and the travel after it is not ours."""
-    text = HEAD + (
-        "G1 X80 E1\nEXCLUDE_OBJECT_END NAME=a\nEXCLUDE_OBJECT_START NAME=b\nG1 E-1\n"
-        "G1 X20 Y20 F9000\nG1 E1\nG1 X40 Y20 E1\nG1 X40 Y40 E1\n"
-    )
-    items = cut(text.encode(), machine)
-    check(items, text.encode())
+def test_comments_of_a_single_object_end_nothing(machine: Machine) -> None:
+    """Who excludes the only object cancels the print."""
+    lines = "; printing object a\nG1 X70 E1\nG1 X80 E1\n; stop printing object a\nG1 Y60 E1\n"
+    pieces = [i for i in cut((HEAD + 3 * lines).encode(), machine) if isinstance(i, Piece)]
+    assert len(pieces) == 2  # the head's, and the object's
+
+
+@pytest.mark.parametrize("firmware", ["klipper", "marlin", "reprapfirmware"])
+@pytest.mark.parametrize(
+    ("a", "b"),
+    [
+        ("EXCLUDE_OBJECT_START NAME=a", "EXCLUDE_OBJECT_END NAME=a\nEXCLUDE_OBJECT_START NAME=b"),
+        ("; printing object a id:0 copy 0", "; printing object b id:0 copy 0"),
+        (";MESH:a", ";MESH:b"),
+        (";PRINTING: a", ";PRINTING: b"),
+        ("M486 S0\n; printing object a", "M486 S-1\n; stop printing object a\nM486 S1"),
+    ],
+)
+def test_object_marks(firmware: str, a: str, b: str) -> None:
+    """A mark ends a piece, and the travel after it is not ours; the same object's does not."""
+    if a.startswith("EXCLUDE") and firmware != "klipper":
+        pytest.skip("no command of theirs")
+    again = f"{a}\n" if a.startswith(";") else ""
+    jump = "G1 E-1\nG1 X20 Y20 F9000\nG1 E1\n"
+    drawn = f"G1 X40 Y20 E1\n{again}G1 X40 Y40 E1\n"
+    text = HEAD + (f"{b}\n" if again else "")
+    text += f"{a}\nG1 X70 E1\nG1 X80 E1\n{again}G1 Y60 E1\n"
+    text += f"{b}\n{jump}{drawn.replace(a, b)}{a}\n{jump}{drawn}"
+    items = cut(text.encode(), ender3_with(firmware))
+    assert text_of(items) == text.encode()
     pieces = [item.text for item in items if isinstance(item, Piece)]
-    assert pieces[1] == b"G1 X80 E1\n"
-    assert pieces[2] == b"G1 X40 Y20 E1\nG1 X40 Y40 E1\n"
-    assert len(pieces) == 3
+    assert pieces[1:] == [
+        f"G1 X80 E1\n{again}G1 Y60 E1\n".encode(),
+        drawn.replace(a, b).encode(),
+        drawn.encode(),
+    ]
 
 
 @pytest.mark.parametrize(
@@ -205,7 +229,10 @@ def test_corpus_is_cut_whole(machine: Machine, shared_dir: Path, folder: str) ->
     ("off", "on"),
     [
         (";STILLPATH_OFF", "; STILLPATH_ON"),
+        ("; stillpath off", "; stillpath on"),
         ("  ;  stillpath_off for this bridge", ";STILLPATH_ON; again"),
+        (";\tSTILLPATH_OFF", "; \t stillpath_on"),
+        (";\u00a0STILLPATH_OFF", ";\u2003STILLPATH_ON"),
     ],
 )
 def test_moves_between_off_and_on_stay_as_they_came(machine, off, on):

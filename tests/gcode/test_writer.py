@@ -171,14 +171,21 @@ def test_rest_lines_without_f(pipeline: Pipeline) -> None:
     )
 
 
-def test_shaper_of_the_machine_is_restored(pipeline: Pipeline, machine: Machine) -> None:
-    shaper = FirmwareShaper(type_x="ei", freq_x_hz=51.5, freq_y_hz=39)
+@pytest.mark.parametrize(
+    ("kind", "written"),
+    [("ei", b"ei"), ("MZV (n=4, t=1.0)", b"mzv(n=4,t=1.0)"), ("smooth_ei", b"smooth_ei")],
+)
+def test_shaper_of_the_machine_is_restored(
+    pipeline: Pipeline, machine: Machine, kind: str, written: bytes
+) -> None:
+    shaper = FirmwareShaper(type_x=kind, freq_x_hz=51.5, freq_y_hz=39)
     firmware = machine.firmware.model_copy(update={"shaper": shaper})
     known = machine.model_copy(update={"firmware": firmware})
     lines = pipeline(HEAD + ROUND + "G28\nM84\n", known).splitlines()
     calls = [k for k, line in enumerate(lines) if line.startswith(b"SET_INPUT_SHAPER")]
     assert len(calls) == 2
-    assert b"SHAPER_TYPE_X=ei SHAPER_FREQ_X=51.5" in lines[calls[1]]
+    words = lines[calls[1]].split(b" ")
+    assert words[1:3] == [b"SHAPER_TYPE_X=" + written, b"SHAPER_FREQ_X=51.5"]
     assert calls[1] < len(lines) - 1 - lines[::-1].index(b"G28")
     assert pipeline.result is not None
     assert not any("shaper" in warning for warning in pipeline.result.warnings)
@@ -186,7 +193,7 @@ def test_shaper_of_the_machine_is_restored(pipeline: Pipeline, machine: Machine)
 
 def test_the_shaper_is_not_switched_for_travel(pipeline: Pipeline, machine: Machine) -> None:
     """Klipper stands still for every SET_INPUT_SHAPER: times say how long, and there are few."""
-    shaper = FirmwareShaper(type_x="ei", freq_x_hz=51.5, type_y="mzv", freq_y_hz=39)
+    shaper = FirmwareShaper(type_x="ei(0.05)", freq_x_hz=51.5, type_y="mzv", freq_y_hz=39)
     firmware = machine.firmware.model_copy(update={"shaper": shaper})
     known = machine.model_copy(update={"firmware": firmware, "pressure_advance_s": 0.05})
     marks = "EXCLUDE_OBJECT_END NAME=a\nEXCLUDE_OBJECT_START NAME=a\nG1 X130 Y90 F9000\n"

@@ -65,6 +65,8 @@ def test_results_are_told_by_their_names(stem: str, suffix: str):
                 "; ",
                 "stillpath",
                 "stillpath_off",
+                " advise",
+                ":",
                 "Processed by stillpath ",
                 "a",
                 "\n",

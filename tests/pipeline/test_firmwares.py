@@ -36,14 +36,25 @@ def body(kind: str) -> bytes:
     return BODY.format(limits=LIMITS[kind], relative=relative).encode()
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_compensated(kind: str, tmp_path: Path, cache: Path) -> None:
+@pytest.mark.parametrize(
+    ("kind", "beside_a_rest"),
+    [
+        *((kind, b"") for kind in KINDS),
+        ("reprapfirmware", b" G91\nG1 X3 Y4 F6000\nG90"),
+        ("reprapfirmware", b" M204 P700"),
+    ],
+)
+def test_compensated(kind: str, beside_a_rest: bytes, tmp_path: Path, cache: Path) -> None:
     machine = ender3_with(kind)
-    data = tagged(body(kind))
+    hop = b"G1 Z5.4 F600"
+    data = tagged(body(kind).replace(hop, hop + beside_a_rest))
     result, written = compensated(data, tmp_path, cache, machine)
     assert result.put_back == []
     assert result.pieces >= 1
     assert differences(data, written, machine) == []
+    if beside_a_rest:  # what a line sets beside its move is the file's own, not a stream's
+        lead = written[: written.index(hop + beside_a_rest.split(b"\n")[0])]
+        assert lead.rindex(b"stream off") > lead.rindex(b"stream on")
     rms = {c.name: c.extruding.contour_rms_um for c in result.channels}
     assert rms["after"] < 0.6 * min(rms["before"], rms["shaper"])
     assert result.time_s == pytest.approx(result.original_time_s, rel=5e-3)

@@ -129,7 +129,14 @@ def restore_state(state: MachineState, command: Command) -> int:
     given = state.extended(command)
     key = given.get("NAME", "default")
     if key not in state.saved:
-        raise state.problem(f"no state {key!r} was saved; SAVE_GCODE_STATE it first", command)
+        if not state.macro_ran:
+            raise state.problem(f"no state {key!r} was saved; SAVE_GCODE_STATE it first", command)
+        state.warn(
+            f"RESTORE_GCODE_STATE NAME={key}: a macro may have saved it; from here on the position "
+            "is not known until the printer homes"
+        )
+        state.forget(origin=True)
+        return state.event(EventKind.UNKNOWN)
     saved = state.saved[key]
     f, i = state.f, state.i
     state.settle()
@@ -165,7 +172,9 @@ def tool(state: MachineState, command: Command) -> int:
     if command.name[1:].isdigit() and int(command.name[1:]) < 100:
         state.settle()
         state.i[at.I_TOOL] = int(command.name[1:])
-    return state.event(state.dialect.otherwise(command.name))
+    kind = state.dialect.otherwise(command.name)
+    state.macro_ran = state.macro_ran or kind == EventKind.UNKNOWN
+    return state.event(kind)
 
 
 def activate_extruder(state: MachineState, command: Command) -> int:

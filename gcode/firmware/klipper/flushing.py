@@ -67,7 +67,7 @@ def shaper(state: MachineState, command: Command) -> int:
             f_hz = _number(given[f"SHAPER_FREQ_{axis}"])
         if f"DAMPING_RATIO_{axis}" in given:
             damping = _number(given[f"DAMPING_RATIO_{axis}"])
-        state.factors[f"shaper {axis}"] = float(_KINDS.index(kind)) if kind in _KINDS else -1.0
+        state.factors[f"shaper {axis}"] = float(_KINDS.index(_modelled(kind)))
         state.factors[f"f_hz {axis}"] = f_hz
         state.factors[f"damping {axis}"] = damping
     return state.event(EventKind.SHAPER, before_s + _ahead_s(state))
@@ -94,17 +94,23 @@ def _shaper(state: MachineState, axis: str) -> tuple[str, float, float]:
     known = state.factors
     if f"shaper {axis}" in known:
         kind = int(known[f"shaper {axis}"])
-        name = _KINDS[kind] if kind >= 0 else ""
-        return name, known[f"f_hz {axis}"], known[f"damping {axis}"]
+        return _KINDS[kind], known[f"f_hz {axis}"], known[f"damping {axis}"]
     s = state.firmware.shaper if isinstance(state.firmware, Klipper) else None
     if s is None:
         return "mzv", 0.0, 0.1
-    x = axis == "X"
-    return (s.type_x, s.freq_x_hz, s.damping_x) if x else (s.type_y, s.freq_y_hz, s.damping_y)
+    if axis == "X":
+        return _modelled(s.type_x), s.freq_x_hz, s.damping_x
+    return _modelled(s.type_y), s.freq_y_hz, s.damping_y
+
+
+def _modelled(kind: str) -> str:
+    """Return the type without its arguments; for one without a model, one about as long."""
+    name = kind.partition("(")[0].strip()
+    return name if name in SHAPERS else "ei"
 
 
 def _reach_s(kind: str, f_hz: float, damping: float) -> float:
-    """Return how far a shaper looks ahead or back, whichever is more; 0: off, or not known."""
+    """Return how far a shaper looks ahead or back, whichever is more; 0: off, or refused."""
     if f_hz <= 0.0:
         return 0.0
     try:

@@ -68,7 +68,9 @@ MARK = ".sp"
 
 _SUFFIXES = (".gcode", ".gco", ".g", ".bgcode")
 # As the service looks for it: at the beginning of a comment.
-_STAMP = re.compile(rb"[^;\n]*(?:; ?stillpath\b|; Processed by stillpath +\S)")
+_STAMP = re.compile(
+    rb"[^;\n]*(?:; ?stillpath(?:| advise|, held back):|; Processed by stillpath +\S)"
+)
 
 
 def is_taken(name: str) -> bool:

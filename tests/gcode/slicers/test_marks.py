@@ -65,6 +65,12 @@ K = MarkKind
         ("; Processed by stillpath 1.0 machine=x", K.STAMP, ""),
         ("; STILLPATH_OFF", K.OFF, ""),
         (";stillpath_on", K.ON, ""),
+        ("; stillpath off for this bridge", K.OFF, ""),
+        ("; Stillpath on", K.ON, ""),
+        ("; stillpath: stream on", K.STAMP, ""),
+        (";stillpath: stream off, line 7 of the original", K.STAMP, ""),
+        ("; stillpath, held back: M204 P500", K.STAMP, ""),
+        ("; stillpath advise: as the file came", K.STAMP, ""),
     ],
 )
 @pytest.mark.parametrize("end", ["", "\r", " \r\n"])
@@ -77,6 +83,7 @@ def test_every_style(comment: str, kind: MarkKind, text: str, end: str) -> None:
     [
         ";",
         "; just words",
+        "; stillpath is fine with this bridge",
         ";LAYER_COUNT:25",
         "; layer_height = 0.2",
         "; LAYER_HEIGHT: thick",

@@ -1,0 +1,143 @@
+"""Which axis follows later, told by the clocks of raw logs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stillpath.models.identification.clocks import Lateness, timed
+from stillpath.models.identification.identify import Measured, identify
+from stillpath.models.identification.prompt import delay_of, delayed
+from stillpath.models.identification.readers import ReadSettings
+from stillpath.models.identification.synthetic import LIS2DW, simulate_log
+from stillpath.models.identification.types import (
+    AccelerationLog,
+    Axis,
+    AxisIdentification,
+    Excitation,
+)
+from stillpath.models.plants import (
+    PairsSpec,
+    PlantSetSpec,
+    PlantSpec,
+    PolePair,
+    RelativeMode,
+    RelativeModesSpec,
+    frequency_response,
+)
+
+TEST = Excitation((1.0, 0.0), f_start_hz=5.0, f_end_hz=100.0, hz_per_s=2.0)
+GUIDED = RelativeModesSpec(
+    modes=(RelativeMode(f_hz=42.0, zeta=0.09, share=1.0, grounded=0.5),),
+)
+FREE = RelativeModesSpec(modes=(RelativeMode(f_hz=48.0, zeta=0.05, share=1.0),))
+
+
+def logged(axis: str, run: int, lead_s: float = 0.0) -> AccelerationLog:
+    test = replace(TEST, direction=(1.0, 0.0) if axis == "x" else (0.0, 1.0))
+    log = simulate_log(
+        {"x": FREE, "y": GUIDED},
+        test,
+        # Every sensor delays, both axes alike.
+        sensor=replace(LIS2DW, delay_s=0.6e-3),
+        lead_s=lead_s,
+        tail_s=0.0,
+        rng=np.random.default_rng([run, axis == "x"]),
+    )
+    return replace(log, source=f"raw_data_{axis}_{run}.csv")
+
+
+def delays_s(logs: Sequence[AccelerationLog]) -> dict[str, float]:
+    settings = ReadSettings(f_end_hz=TEST.f_end_hz, hz_per_s=TEST.hz_per_s)
+    found = identify([Measured(log) for log in logs], settings)
+    return {axis: delay_of(one.plants.nominal) for axis, one in found.items()}
+
+
+def test_an_axis_whose_guides_damp_it_is_later() -> None:
+    """The truth: half of a damping of .09 at 42 Hz acts against the guides."""
+    found = delays_s([logged("x", 0), logged("y", 0)])
+    assert GUIDED.delay_s == pytest.approx(0.341e-3, abs=1e-6)
+    assert found["x"] == pytest.approx(0.0, abs=1e-9)
+    # A sample of the sensor lasts .63 ms, and the log begins anywhere within one.
+    assert found["y"] == pytest.approx(GUIDED.delay_s, abs=0.35e-3)
+    assert found["y"] > 0.0
+
+
+def test_nobody_knows_where_a_log_was_cut_off() -> None:
+    cut = logged("y", 0, lead_s=0.2)
+    assert delays_s([logged("x", 0), cut]) == pytest.approx({"x": 0.0, "y": 0.0}, abs=1e-9)
+
+
+def of_both(**plants: PlantSpec) -> dict[Axis, AxisIdentification]:
+    return {
+        axis: AxisIdentification(axis=axis, plants=PlantSetSpec(nominal=plants[axis]))
+        for axis in ("x", "y")
+    }
+
+
+def in_bands(*late_ms: float, whole: bool = True) -> Lateness:
+    return Lateness(1e-3 * np.array(late_ms), whole)
+
+
+BOTH = of_both(x=FREE, y=FREE)
+ON_TIME = in_bands(0.3, 0.3, 0.3, 0.3)
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "expected_ms"),
+    [
+        ([ON_TIME], [in_bands(0.5, 0.5, 0.5, 0.5)], {"y": 0.2}),
+        ([in_bands(0.6, 0.6, 0.6, 0.6)], [ON_TIME], {"x": 0.3}),
+        # One band is that of a mode that was not found.
+        ([ON_TIME], [in_bands(0.5, 1.4, 0.52, 0.54)], {"y": 0.22}),
+        ([ON_TIME], [in_bands(0.25, 1.1, 0.67, 0.62)], {}),
+        ([ON_TIME], [in_bands(0.5, np.nan, 0.5, np.nan)], {}),
+        # Less than the clocks tell, and more than guides do.
+        ([ON_TIME], [in_bands(0.32, 0.33, 0.34, 0.33)], {}),
+        ([ON_TIME], [in_bands(2.5, 2.5, 2.5, 2.5)], {}),
+        # Logs with a rest before the test count if all are alike.
+        ([in_bands(*4 * [500.0], whole=False)], [in_bands(*4 * [500.2], whole=False)], {}),
+        (
+            2 * [in_bands(*4 * [500.0], whole=False)],
+            2 * [in_bands(*4 * [500.2], whole=False)],
+            {"y": 0.2},
+        ),
+        # One alignment missed by a swing.
+        ([ON_TIME, ON_TIME, in_bands(*4 * [83.0])], [in_bands(0.5, 0.5, 0.5, 0.5)], {"y": 0.2}),
+        ([ON_TIME, in_bands(*4 * [83.0])], [in_bands(0.5, 0.5, 0.5, 0.5)], {}),
+        ([], [ON_TIME], {}),
+    ],
+)
+def test_what_the_logs_of_both_axes_agree_on(
+    x: list[Lateness], y: list[Lateness], expected_ms: dict[str, float]
+) -> None:
+    found = timed(BOTH, {"x": x, "y": y})
+    told_ms = {
+        axis: round(1e3 * delay_of(one.plants.nominal), 6)
+        for axis, one in found.items()
+        if one.plants != BOTH[axis].plants
+    }
+    assert told_ms == pytest.approx(expected_ms)
+    assert [axis for axis, one in found.items() if one.notes] == list(expected_ms)
+
+
+@pytest.mark.parametrize(
+    "plant",
+    [
+        FREE,
+        PairsSpec(poles=(PolePair(f_hz=40.0, zeta=0.08), PolePair(f_hz=90.0, zeta=0.05))),
+    ],
+)
+def test_a_delayed_plant_is_late_and_resonates_as_before(plant: RelativeModesSpec) -> None:
+    prompt = plant.without_delay()
+    late = delayed(prompt, 0.2e-3)
+    assert delay_of(late) == pytest.approx(0.2e-3, rel=1e-9)
+    f_hz = np.array([5.0, 40.0])
+    ratio = frequency_response(late, f_hz) / frequency_response(prompt, f_hz)
+    assert np.abs(ratio) == pytest.approx([1.0, 1.0], abs=0.01)
+    assert -np.angle(ratio) / (2 * np.pi * f_hz) == pytest.approx([0.2e-3, 0.2e-3], rel=0.05)
+    # No more than if all of the damping acted against the guides.
+    assert delay_of(delayed(prompt, 1.0)) < 5e-3
