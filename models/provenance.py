@@ -59,7 +59,8 @@ class Provenance(Document):
     slow_delay_s : (float, float), optional
         Least and largest delay of slow motion of the plants that explain the measurement. Of a
         spectrum the members have it; those of a response are advanced by it, as nobody knows what
-        of it is the recording's.
+        of it is the recording's. Where the clocks of raw logs show that an axis follows later than
+        the other, its members have a delay within this range (`identification.clocks`).
     coherent_share : float, optional
         Of the measured frequencies, those at which the motion follows the command.
     coherent_band_hz : (float, float), optional

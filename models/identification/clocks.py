@@ -9,6 +9,7 @@ time.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -37,6 +38,9 @@ _AGREE_S = 0.5e-3
 """Largest distance of a log from the median of its axis: alignment may miss by a whole swing."""
 _LEAST_APART_S, _MOST_APART_S = 0.05e-3, 1.5e-3
 """Differences between the axes that are clear and plausible."""
+_USUAL_S = 0.25e-3
+"""Typical difference between the axes: guides that take a fifth of the damping at 40 Hz."""
+_SAME_RATE = 1.2
 _STOP_S = 0.03
 """Longest braking after the test, which is in the log too."""
 
@@ -49,11 +53,14 @@ class Lateness:
     ----------
     late_s : ndarray, shape (bands,)
         Against a test that begins with the log, by band. The sensor's delay is in it.
+    interval_s : float
+        Between samples: the log begins anywhere within one of them after the test.
     whole : bool
         Whether the log has the length of the test, so that it does begin with it.
     """
 
     late_s: Array
+    interval_s: float
     whole: bool
 
 
@@ -72,11 +79,10 @@ def lateness(
         Start of the test, on the clock of the log, to which `response` refers.
     """
     interval_s = float(np.median(np.diff(log.time_s)))
-    # The first sample lies anywhere within an interval after the start.
     began_s = float(log.time_s[0]) - 0.5 * interval_s
     beyond_s = float(log.time_s[-1] - log.time_s[0]) - regenerate(test).duration_s
     whole = -2.0 * interval_s <= beyond_s <= _STOP_S
-    return Lateness(started_s - began_s + _lags_s(response, plant), whole)
+    return Lateness(started_s - began_s + _lags_s(response, plant), interval_s, whole)
 
 
 def timed(
@@ -85,7 +91,7 @@ def timed(
     """Delay the plants of the axis that follows later, if the logs tell which.
 
     Logs must agree within an axis. They may begin before the test, all alike, if there are two of
-    each axis.
+    each axis. Sensors of different rates have delays of their own, so they tell nothing.
     """
     known = {axis: _agreeing(late.get(axis, ())) for axis in ("x", "y")}
     if not all(known.values()) or not all(
@@ -93,10 +99,16 @@ def timed(
     ):
         return dict(found)
     x_s, y_s = (np.median([one.late_s for one in known[axis]], axis=0) for axis in ("x", "y"))
+    intervals_s = [one.interval_s for logs in known.values() for one in logs]
     apart_s = _alike(y_s - x_s)
-    if apart_s is None or not _LEAST_APART_S <= abs(apart_s) <= _MOST_APART_S:
+    if max(intervals_s) > _SAME_RATE * min(intervals_s) or apart_s is None:
         return dict(found)
-    later_s = abs(apart_s)
+    sd_s = float(np.mean(intervals_s)) * math.sqrt(sum(1 / len(k) for k in known.values()) / 12)
+    # What is to be expected of the difference, given that most machines have little.
+    share = 1.0 / (1.0 + (sd_s / _USUAL_S) ** 2)
+    later_s = share * abs(apart_s)
+    if not _LEAST_APART_S <= later_s <= _MOST_APART_S:
+        return dict(found)
     later: Axis = "y" if apart_s > 0.0 else "x"
     other = "X" if later == "y" else "Y"
     one = found[later]
@@ -104,7 +116,7 @@ def timed(
         f"by the clocks of the logs the axis follows {1e3 * later_s:.2f} ms later than {other}: "
         "commands allow for it"
     )
-    plants = _later(one.plants, later_s)
+    plants = _later(one.plants, later_s, 2.0 * sd_s * math.sqrt(share))
     return {**found, later: replace(one, plants=plants, notes=(*one.notes, note))}
 
 
@@ -118,14 +130,23 @@ def _agreeing(logs: Sequence[Lateness]) -> list[Lateness]:
     return near if 2 * len(near) > len(logs) else []
 
 
-def _later(plants: PlantSetSpec, delay_s: float) -> PlantSetSpec:
+def _later(plants: PlantSetSpec, delay_s: float, unsure_s: float) -> PlantSetSpec:
     members = plants.members
     if not isinstance(members, ParametricMembers):
         members = tuple(
             one.model_copy(update={"plant": delayed(one.plant, delay_s)}) for one in members
         )
-    nominal = delayed(plants.nominal, delay_s)
-    return plants.model_copy(update={"nominal": nominal, "members": members})
+    about = plants.provenance
+    if about is not None:
+        span_s = (max(0.0, delay_s - unsure_s), delay_s + unsure_s)
+        about = about.model_copy(update={"slow_delay_s": span_s})
+    return plants.model_copy(
+        update={
+            "nominal": delayed(plants.nominal, delay_s),
+            "members": members,
+            "provenance": about,
+        }
+    )
 
 
 def _alike(apart_s: Array) -> float | None:
