@@ -41,7 +41,8 @@ _FRICTION_UNSEEN_MM_S2 = 1500.0
 _STEPS_UNSURE = 0.2
 """Relative spread over the members of the error caused by whole motor steps: a guess."""
 _LAG_UNSURE_S = 1.5e-4
-"""Unknown delay of X against Y: alignment sets both to 0, but viscous guides may delay one."""
+"""Unknown delay of X against Y: alignment sets both to 0, but viscous guides may delay one; clocks
+of logs tell some of it (`models.identification.clocks`)."""
 _SLOW_HZ = 3.0
 """Well below all modes: there a plant follows its command but for the bend of its springs."""
 
