@@ -169,9 +169,9 @@ def stated_note(machine: Machine, shaper: BestShaper) -> str | None:
     if not typed:
         return None
     return (
-        f"{' and '.join(typed)}: only the resonance was typed in, so the file moves as through the "
-        f"shaper {shaper.label}, which a firmware with input shaping does by itself. A better "
-        "command needs a measurement (docs/identification.md). The figures are guesses for "
+        f"{' and '.join(typed)}: only the resonance was typed in, so what is compensated moves as "
+        f"through the shaper {shaper.label}, which a firmware with input shaping does by itself. A "
+        "better command needs a measurement (docs/identification.md). The figures are guesses for "
         "machines that ring there."
     )
 
