@@ -118,6 +118,7 @@ def test_what_is_left_alone_begins_where_it_was_switched_off(tmp_path: Path, cac
         ("annex-k3", 32.0, True, True),
         ("annex-k3", 400.0, False, False),
         ("generic-bedslinger", 32.0, False, True),
+        ("generic-bedslinger", 400.0, False, False),
     ],
 )
 def test_where_the_shaper_would_serve_better_it_is_said(
