@@ -35,6 +35,9 @@ _DEFAULT_ZETA = 0.07
 _ACCEL_ROOM, _SPEED_ROOM, _CORNERS = 1.5, 1.2, 6.0
 """Limits assumed for motors where none are stated: these multiples of the acceleration, speed and
 corner speed that the printer allows a file."""
+_MARLIN_ROOM, _MARLIN_MM_S2 = 3.0, 6000.0
+"""Multiple of the acceleration on Marlin, and up to where: with few short moves in its queue it
+does not reach a print's speed on 1.5 times a low limit, and every piece would stay as sliced."""
 _LEAST_STEP_MM_S = 20.0
 _ROUNDING = 1.001
 """Ratio up to which two limits count as equal."""
@@ -239,11 +242,11 @@ def derived_envelope(machine: Machine) -> CommandLimits:
     state better values. `axes` are set if the printer has separate limits for X and Y; the motors
     of a CoreXY are assumed to follow what a file's diagonals need.
     """
-    x, y = (_borne(machine.firmware.allowance(axis)) for axis in ("x", "y"))
+    x, y = (_borne(machine, machine.firmware.allowance(axis)) for axis in ("x", "y"))
     least = {name: min(value, y[name]) for name, value in x.items()}
     if machine.kinematics == "corexy":
         # An integer, not below what a diagonal at the head's own limit needs.
-        accel = math.ceil(_ACCEL_ROOM * machine.firmware.motor_accel_mm_s2())
+        accel = math.ceil(_accel_borne(machine, machine.firmware.motor_accel_mm_s2()))
         return CommandLimits(**least, motors=MotorLimits(accel_mm_s2=accel))
     if machine.firmware.kind == "klipper":
         return CommandLimits(**least)
@@ -255,13 +258,20 @@ def derived_envelope(machine: Machine) -> CommandLimits:
     return CommandLimits(**least, axes=more)
 
 
-def _borne(allowed: AxisAllowance) -> dict[str, float]:
+def _borne(machine: Machine, allowed: AxisAllowance) -> dict[str, float]:
     step = _CORNERS * allowed.corner_mm_s
     return {
         "velocity_mm_s": _SPEED_ROOM * allowed.speed_mm_s,
-        "accel_mm_s2": _ACCEL_ROOM * allowed.accel_mm_s2,
+        "accel_mm_s2": _accel_borne(machine, allowed.accel_mm_s2),
         "speed_step_mm_s": min(max(step, _LEAST_STEP_MM_S), CommandLimits().speed_step_mm_s),
     }
+
+
+def _accel_borne(machine: Machine, allowed_mm_s2: float) -> float:
+    usual = _ACCEL_ROOM * allowed_mm_s2
+    if machine.firmware.kind != "marlin":
+        return usual
+    return max(usual, min(_MARLIN_ROOM * allowed_mm_s2, _MARLIN_MM_S2))
 
 
 def with_firmware(machine: Machine, section: dict[str, Any]) -> Machine:
@@ -300,9 +310,8 @@ def envelope_warnings(machine: Machine) -> list[str]:
         found["motors.accel_mm_s2"] = (motors[0], motors[1])
     return [
         f"{machine.name}: a command may ask the motors for {asked:.0f} mm/s2 (command.{place}), "
-        f"more than {_ACCEL_ROOM:g} times what the printer allows a file "
-        f"({most / _ACCEL_ROOM:.0f}): right if the motors were tested at that "
-        f"acceleration; otherwise put {most:.0f} there"
+        f"more than the {most:.0f} that the printer's own limits for a file suggest: right if the "
+        f"motors were tested at that acceleration; otherwise put {most:.0f} there"
         for place, (asked, most) in found.items()
     ]
 
