@@ -56,6 +56,8 @@ _LEVEL_UNKNOWN = "level not checked: nothing between 8 and 15 Hz follows the com
 _WEAKEST_DRIVE = 1e-5
 _MOST_POINTS = 4096
 _REST = 0.25
+_MOST_SD = 0.15
+"""Standard deviation, as a share of the response, up to which a drive with transients is used."""
 
 
 def estimate_response(
@@ -212,6 +214,10 @@ def estimate_driven(
     half = max(*(reach * r.spacing_hz for r in records), 4.0 * _nyquist_hz(records) / _MOST_POINTS)
     f_hz = _driven_grid(records, half)
     found = local_response(records, f_hz, half, transient=transient)
+    if transient:
+        # Beside a sweep the transients explain the bins by themselves: coherent, but no response.
+        known = found.sd <= _MOST_SD * np.abs(found.response)
+        found = replace(found, coherence=np.where(known, found.coherence, 0.0))
     return _driven_response(logs, f_hz, found, label)
 
 

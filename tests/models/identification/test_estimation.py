@@ -222,6 +222,28 @@ def test_recorded_drives_give_the_response_of_python_control(logs: int) -> None:
     assert found.source.startswith("log0.csv")
 
 
+@pytest.mark.parametrize(("fade_s", "rest_s"), [(0.0, 0.0), (0.5, 0.0), (0.5, 0.5), (0.0, 0.2)])
+def test_a_sweep_without_long_rests_is_coherent_only_where_it_drives(
+    fade_s: float, rest_s: float
+) -> None:
+    """Transients explained all bins outside the sweep, and the first noise became a mode."""
+    rate_hz, last_hz, lasts_s = 1000.0, 110.0, 60.0
+    rest = np.zeros(round(rest_s * rate_hz))
+    t = np.arange(round(lasts_s * rate_hz)) / rate_hz
+    phase = 2 * np.pi * (5.0 * t + 0.5 * (last_hz - 5.0) / lasts_s * t**2)
+    fade = np.clip(np.minimum(t, lasts_s - t) / max(fade_s, 1e-9), 0.0, 1.0)
+    command = np.concatenate([rest, fade * np.sin(phase), rest])
+    _, plant = driven_log(1, 0)
+    answer = control.forced_response(plant, inputs=command).outputs
+    noise = np.random.default_rng(9).normal(size=len(answer))
+    answer = answer + 0.01 * np.std(answer) * noise
+    log = DrivenLog(np.arange(len(answer)) / rate_hz, command, answer, "x")
+    found = estimate_driven(log)
+    used = found.coherence >= 0.95
+    assert np.all(found.sd[used] <= 0.15 * np.abs(found.response[used]))
+    assert np.mean(used[(found.f_hz > 6.0) & (found.f_hz < 90.0)]) > 0.97
+
+
 @pytest.mark.parametrize("at_rest", [True, False])
 def test_gravity_in_a_recorded_drive_changes_nothing(at_rest: bool) -> None:
     log, plant = driven_log(20_000, 3)
