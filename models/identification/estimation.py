@@ -9,6 +9,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import next_fast_len, rfft
+from scipy.interpolate import CubicSpline
 from scipy.signal.windows import tukey
 
 from stillpath.models.arrays import Array
@@ -201,7 +202,7 @@ def estimate_driven(
     FrequencyResponse
         At the frequencies with at least -50 dB of the strongest drive.
     """
-    logs = _several(driven)
+    logs = [_uniform(log) for log in _several(driven)]
     records = []
     transient = not all(_rests(log.command) for log in logs)
     for log in logs:
@@ -318,6 +319,16 @@ def _several(driven: DrivenLog | Sequence[DrivenLog]) -> tuple[DrivenLog, ...]:
     if len(axes) > 1:
         raise ModelError(f"logs of different axes ({', '.join(sorted(axes))}); one axis at a time")
     return logs
+
+
+def _uniform(log: DrivenLog) -> DrivenLog:
+    """Return the log at its usual sampling interval throughout, by cubic splines."""
+    steps = np.diff(log.time_s)
+    count = round(float(np.sum(steps) / np.median(steps))) + 1
+    time_s = np.linspace(log.time_s[0], log.time_s[-1], count)
+    columns = np.stack([log.command, log.measured], axis=1)
+    command, measured = CubicSpline(log.time_s, columns)(time_s).T
+    return replace(log, time_s=time_s, command=command, measured=measured)
 
 
 def _rests(values: Array) -> bool:

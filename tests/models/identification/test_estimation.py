@@ -244,6 +244,19 @@ def test_a_sweep_without_long_rests_is_coherent_only_where_it_drives(
     assert np.mean(used[(found.f_hz > 6.0) & (found.f_hz < 90.0)]) > 0.97
 
 
+def test_a_sampling_interval_that_changes_is_no_other_frequency() -> None:
+    """The mean rate stretched both parts of the record, and a wrong response was coherent."""
+    log, plant = driven_log(40_000, 5, noise=0.0)
+    smooth = np.convolve(log.command, np.hanning(12) / 6.0, mode="same")
+    answer = control.forced_response(plant, inputs=smooth).outputs
+    kept = np.arange(40_000)
+    kept = kept[(kept < 20_000) | (kept % 2 == 0)]
+    found = estimate_driven(DrivenLog(log.time_s[kept], smooth[kept], answer[kept], "x"))
+    at = (found.f_hz > 5.0) & (found.f_hz < 100.0)
+    truth = plant(np.exp(2j * np.pi * found.f_hz[at] / 1000))
+    assert np.quantile(np.abs(found.response[at] / truth - 1.0), 0.95) < 0.02
+
+
 @pytest.mark.parametrize("at_rest", [True, False])
 def test_gravity_in_a_recorded_drive_changes_nothing(at_rest: bool) -> None:
     log, plant = driven_log(20_000, 3)
