@@ -100,11 +100,14 @@ class Summary:
             ]
         if self.choice is not None:
             steps = any(adapter(self.machine).step_mm[:2])
-            channels = self.choice.ranged(channels, steps=steps)
+            share = self.totals.compensated_share
+            channels = self.choice.ranged(channels, steps=steps, share=share)
         return channels
 
     def _warnings(self, channels: list[Channel]) -> Iterator[str]:
-        typed = stated_note(self.machine, self.shaper) if self.choice is not None else None
+        typed = None
+        if self.choice is not None and self.totals.compensated_share > 0.0:
+            typed = stated_note(self.machine, self.shaper)
         if self.writer is not None:
             # First, because it advises against printing the file.
             rms_um = {c.name: c.judged_rms_um for c in channels}

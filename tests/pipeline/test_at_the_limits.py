@@ -135,6 +135,18 @@ def test_where_the_shaper_would_serve_better_it_is_said(
     assert any("shaper would serve this file better" in w for w in result.warnings) is told
 
 
+@pytest.mark.parametrize("name", ["ender3", "generic-bedslinger"])
+def test_what_is_not_compensated_has_the_range_of_the_sliced_file(
+    name: str, tmp_path: Path, cache: Path
+) -> None:
+    """It had the wide range of the command that was not written, and was called a shaper's."""
+    result, _ = compensated(HEAD + "; STILLPATH_OFF\n" + RINGS, tmp_path, cache, name)
+    before, after = (c for c in result.channels if c.name in ("before", "after"))
+    assert after.judged_rms_um == pytest.approx(before.judged_rms_um, rel=0.01)
+    assert after.contour_range_um == pytest.approx(before.contour_range_um, rel=0.01)
+    assert not any("typed in" in warning for warning in result.warnings)
+
+
 def fast(machine: Machine, speed_mm_s: float) -> Machine:
     """The machine with another highest speed of the command."""
     return machine.model_copy(update={"command": CommandLimits(velocity_mm_s=speed_mm_s)})
