@@ -32,6 +32,7 @@ __all__ = [
 
 _DEFAULT_HZ = 50.0
 _DEFAULT_ZETA = 0.07
+_RESONANCES_HZ, _DAMPING = (1.0, 500.0), (1e-3, 1.0)
 _ACCEL_ROOM, _SPEED_ROOM, _CORNERS = 1.5, 1.2, 6.0
 """Limits assumed for motors where none are stated: these multiples of the acceleration, speed and
 corner speed that the printer allows a file."""
@@ -231,7 +232,22 @@ def not_followed(config: PrinterConfig) -> list[str]:
 
 
 def stated_axis(f_hz: float, zeta: float) -> dict[str, Any]:
-    """Return an unmeasured axis of one resonance; without a frequency (0), of 50 Hz."""
+    """Return an unmeasured axis of one resonance; without a frequency (0), of 50 Hz.
+
+    Raises
+    ------
+    ModelError
+        For a resonance or a damping ratio that no axis has.
+    """
+    for what, value, (least, most), unit in (
+        ("resonance", f_hz or _DEFAULT_HZ, _RESONANCES_HZ, " Hz"),
+        ("damping ratio", zeta, _DAMPING, ""),
+    ):
+        if not least <= value <= most:
+            raise ModelError(
+                f"a {what} of {value:g}{unit} was stated; it must be {least:g} to {most:g}{unit}: "
+                "give the one of the axis (--fx, --fy, --zeta, or the configuration's shaper)"
+            )
     return typed_in(f_hz or _DEFAULT_HZ, zeta).model_dump(mode="json", exclude_none=True)
 
 
