@@ -109,6 +109,13 @@ def estimate_aligned(
             f"{log.source}: the log reaches {aligned.f_reached_hz:.1f} Hz of the sweep only; "
             "record the whole test"
         )
+    shown_hz = 0.5 * aligned.rate_hz
+    if shown_hz <= aligned.f_reached_hz:
+        raise ModelError(
+            f"{log.source}: {aligned.rate_hz:g} samples per s show less than {shown_hz:g} Hz, and "
+            f"the test goes to {aligned.f_reached_hz:g} Hz; set a higher rate of the sensor, or "
+            f"give max_freq = {shown_hz - 2.0:.0f} to use what is there"
+        )
     f_hz = np.arange(np.ceil(first / _STEP_HZ), np.floor(last / _STEP_HZ) + 1) * _STEP_HZ
     found = response_at(aligned, f_hz)
     # The command is known as averages over sampling intervals, the sensor's data as points.

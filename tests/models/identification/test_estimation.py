@@ -185,6 +185,14 @@ def test_a_soft_axis_with_a_noisy_sensor_is_used_where_it_follows() -> None:
     np.testing.assert_allclose(np.abs(found.response[used]), truth, rtol=0.1)
 
 
+def test_a_sensor_that_is_too_slow_for_the_test_is_named() -> None:
+    log = replace(measured(MODES, NEW, sensor=Sensor(rate_hz=200.0)), source="raw_data_x.csv")
+    with pytest.raises(ModelError, match=r"raw_data_x\.csv: 200 samples per s .* max_freq = 98 to"):
+        estimate_response(log, NEW)
+    short = replace(NEW, f_end_hz=98.0)
+    assert estimate_response(log, short).f_hz[-1] == pytest.approx(97.0)
+
+
 def test_a_level_that_cannot_be_checked_is_noted() -> None:
     high = replace(SHORT, f_start_hz=20.0, f_end_hz=60.0)
     found = estimate_response(measured(MODES, high), high)
