@@ -53,8 +53,8 @@ class NewMachine:
 
     name: Annotated[str, typer.Option("--name", help="The machine's name.")]
     title: Annotated[str, typer.Option(help="What people call it.")] = ""
-    fx: Annotated[float | None, typer.Option(min=1.0, help="Resonance of X, Hz.")] = None
-    fy: Annotated[float | None, typer.Option(min=1.0, help="Resonance of Y, Hz.")] = None
+    fx: Annotated[float | None, typer.Option(min=1.0, max=500.0, help="Resonance of X, Hz.")] = None
+    fy: Annotated[float | None, typer.Option(min=1.0, max=500.0, help="Resonance of Y, Hz.")] = None
     zeta: Annotated[float, typer.Option(min=0.001, max=1.0, help="Damping ratio.")] = 0.07
 
 

@@ -56,8 +56,6 @@ class CautiousFbf:
     """
 
     name = "fbf"
-    lead_s = 0.0
-    tail_s = 0.0
 
     def __init__(self, inner: PreviewFbf, machine: Machine, dt_s: float, caution: Caution) -> None:
         if not all(0.0 <= share <= 1.0 for share in caution.shares):
@@ -67,6 +65,10 @@ class CautiousFbf:
         self._smoothing = ShaperCompensator(
             machine, dt_s, shaper=caution.shaper, fx_hz=caution.fx_hz, fy_hz=caution.fy_hz
         )
+        # A shaper spreads every motion over its length; filtered basis functions end with the plan.
+        alone = not any(caution.shares)
+        self.lead_s = self._smoothing.lead_s if alone else 0.0
+        self.tail_s = self._smoothing.tail_s if alone else 0.0
         self._shares = np.array(caution.shares)[:, None]
         self._shaper_alone = False
         self._last = np.zeros((2, 0))

@@ -109,6 +109,9 @@ class ShaperCompensator(Memoryless):
         self.frequencies_hz = (chosen[0], chosen[1])
         self.pulses = [shaper_pulses(shaper, f_hz, zeta) for f_hz in chosen]
         self._blend = max(2, round(0.03 / dt_s))
+        # Centred: half of the pulses come before the plan, half of them after it.
+        self.lead_s = max(float(weights @ delays) for weights, delays in self.pulses)
+        self.tail_s = max(float(delays[-1] - weights @ delays) for weights, delays in self.pulses)
 
     def compensate(
         self,

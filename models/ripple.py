@@ -49,6 +49,7 @@ RippleAxis = Literal["x", "y", "a", "b"]
 
 STEEPEST = 0.5
 """Largest slope |d delta / d s|: beyond 1 the motor would have to turn back to move on."""
+_LARGEST_UM = 5000.0
 
 
 class RippleHarmonic(Document):
@@ -106,6 +107,12 @@ class AxisRipple(Document):
             raise ValueError(
                 f"the input ripple has a slope of up to {slope:.2g} mm per mm, more than "
                 f"{STEEPEST}: check amplitude_um (micrometres) and pitch_mm (millimetres)"
+            )
+        largest_um = max(h.amplitude_um for source in self.sources for h in source.harmonics)
+        if largest_um > _LARGEST_UM:
+            raise ValueError(
+                f"amplitude_um is {largest_um:g}, at most {_LARGEST_UM:g} is a ripple: it is in "
+                "micrometres"
             )
         return self
 

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from stillpath.models.document import Document, Finite, Positive
+from stillpath.models.document import Document, Positive
 from stillpath.models.errors import ModelError
 from stillpath.models.plant_specs import (
     FirSpec,
@@ -124,12 +124,15 @@ class MassSchedule(Document):
             )
 
 
+_Place = Annotated[float, Field(ge=-1e5, le=1e5, allow_inf_nan=False)]
+
+
 class GridNode(Document):
     """The plant at one point; coordinates that do not matter are left out."""
 
-    x_mm: Finite | None = None
-    y_mm: Finite | None = None
-    z_mm: Finite | None = None
+    x_mm: _Place | None = None
+    y_mm: _Place | None = None
+    z_mm: _Place | None = None
     plant: Annotated[Followed, Field(discriminator="kind")]
 
 

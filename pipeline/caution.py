@@ -112,15 +112,29 @@ class Choice:
             return _LEAST_FIT
         return float(np.clip(self.rms_um / _COARSE_UM, _LEAST_FIT, 1.0))
 
-    def ranged(self, channels: Sequence[Channel], *, steps: bool) -> list[Channel]:
-        """Return the channels of a report with the range over the members."""
+    def ranged(
+        self, channels: Sequence[Channel], *, steps: bool, share: float = 1.0
+    ) -> list[Channel]:
+        """Return the channels of a report with the range over the members.
+
+        Parameters
+        ----------
+        steps : bool
+            Whether the figures include whole motor steps.
+        share : float
+            Share of the extruding time that is compensated; the rest moves as sliced.
+        """
         before_um = next(c.judged_rms_um for c in channels if c.name == "before")
         reference = self.ranges.get("before")
         harder = before_um / max(reference.reference_um, 1e-9) if reference else 1.0
         updated = []
         for channel in channels:
-            if channel.name in self.ranges:
-                channel = self.ranges[channel.name].applied_to(channel, harder, steps=steps)
+            known = self.ranges.get(channel.name)
+            if known is not None:
+                if channel.name == "after" and reference is not None:
+                    left = (1.0 - share) * (before_um / max(channel.judged_rms_um, 1e-9)) ** 2
+                    known = known.mixed(reference, min(left, 1.0) if share else 1.0)
+                channel = known.applied_to(channel, harder, steps=steps)
             updated.append(channel)
         return updated
 
@@ -169,9 +183,9 @@ def stated_note(machine: Machine, shaper: BestShaper) -> str | None:
     if not typed:
         return None
     return (
-        f"{' and '.join(typed)}: only the resonance was typed in, so the file moves as through the "
-        f"shaper {shaper.label}, which a firmware with input shaping does by itself. A better "
-        "command needs a measurement (docs/identification.md). The figures are guesses for "
+        f"{' and '.join(typed)}: only the resonance was typed in, so what is compensated moves as "
+        f"through the shaper {shaper.label}, which a firmware with input shaping does by itself. A "
+        "better command needs a measurement (docs/identification.md). The figures are guesses for "
         "machines that ring there."
     )
 

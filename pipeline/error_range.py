@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import TypeAlias
 
 import numpy as np
@@ -88,6 +88,15 @@ class ErrorRange:
         return (
             math.hypot(self.low * own_um, (1.0 - _STEPS_UNSURE) * rounded_um),
             math.hypot(self.high * own_um, (1.0 + _STEPS_UNSURE) * rounded_um),
+        )
+
+    def mixed(self, other: ErrorRange, part: float) -> ErrorRange:
+        """Return the range where this part of the squared error is left by another command."""
+        return ErrorRange(
+            *(
+                math.sqrt((1.0 - part) * own**2 + part * its**2)
+                for own, its in zip(astuple(self), astuple(other), strict=True)
+            )
         )
 
     def applied_to(self, channel: Channel, harder: float = 1.0, *, steps: bool = False) -> Channel:

@@ -22,6 +22,7 @@ from stillpath.models.machine import Machine
 from stillpath.version import __version__
 
 __all__ = [
+    "LEAST_BUDGET_UM",
     "BasisName",
     "BudgetUm",
     "DialectName",
@@ -62,7 +63,8 @@ RobustMode = Literal["auto", "off", "ensemble", "minimax"]
 DialectName = Literal["klipper", "marlin", "prusa", "bambu", "reprapfirmware"]
 Where = Literal["all", "visible", "walls"]
 MaxMb = Annotated[float, Field(gt=0, le=100_000, allow_inf_nan=False)]
-BudgetUm = Annotated[float, Field(ge=0.5, le=1000, allow_inf_nan=False)]
+LEAST_BUDGET_UM = 0.5
+BudgetUm = Annotated[float, Field(ge=LEAST_BUDGET_UM, le=1000, allow_inf_nan=False)]
 
 
 class Options(BaseModel):

@@ -224,8 +224,18 @@ class PieceCompensator:
         gap_mm = deviation(made, encoded.phases)
         reason = strayed(gap_mm, extruding, self._follow_mm, briefly=briefly)
         if reason is not None:
-            raise _Sudden(f"planned by the firmware's rules, {reason}")
+            raise _Sudden(f"planned by the firmware's rules, {reason}{self._too_slow()}")
         return made
+
+    def _too_slow(self) -> str:
+        """Return what to do where Marlin, with few moves in its queue, stays below their speed."""
+        if self._machine.firmware.kind != "marlin":
+            return ""
+        return (
+            "; Marlin does not reach the speed of short moves where command.accel_mm_s2 "
+            f"({self._machine.command.accel_mm_s2:g}) is low: measure what the motors bear "
+            "(motor-test), and raise it"
+        )
 
     def _fit(
         self, piece: Piece, timeline: Timeline, command: NDArray[np.float64], bend_mm: float

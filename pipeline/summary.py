@@ -30,6 +30,8 @@ __all__ = ["SHAPER_IS_BETTER", "Summary"]
 
 SHAPER_IS_BETTER = "The firmware's own shaper would serve this file better"
 """Beginning of the warning."""
+_AS_GOOD = 1.2
+"""Ratio to the shaper's error from which a file that imitates that shaper is called worse."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,16 +100,20 @@ class Summary:
             ]
         if self.choice is not None:
             steps = any(adapter(self.machine).step_mm[:2])
-            channels = self.choice.ranged(channels, steps=steps)
+            share = self.totals.compensated_share
+            channels = self.choice.ranged(channels, steps=steps, share=share)
         return channels
 
     def _warnings(self, channels: list[Channel]) -> Iterator[str]:
-        typed = stated_note(self.machine, self.shaper) if self.choice is not None else None
+        typed = None
+        if self.choice is not None and self.totals.compensated_share > 0.0:
+            typed = stated_note(self.machine, self.shaper)
+        if self.writer is not None:
+            # First, because it advises against printing the file.
+            rms_um = {c.name: c.judged_rms_um for c in channels}
+            yield from self._outdone(rms_um, 1.0 if typed is None else _AS_GOOD)
         if typed is not None:
             yield typed
-        elif self.writer is not None:
-            # First, because it advises against printing the file.
-            yield from self._outdone({c.name: c.judged_rms_um for c in channels})
         yield from self.totals.warnings
         yield from passed_over(self.reader)
         yield from self.measurement.warnings()
@@ -132,11 +138,11 @@ class Summary:
         if self.budget is not None:
             yield self.budget[1].note
 
-    def _outdone(self, rms_um: dict[str, float]) -> Iterator[str]:
+    def _outdone(self, rms_um: dict[str, float], least_ratio: float) -> Iterator[str]:
         """Yield a warning where the firmware's shaper, without compensation, would do better."""
         ours, shaper = rms_um["after"], rms_um["shaper"]
         compared = self.budget is None and not self.options.method.startswith("shaper:")
-        if compared and ours >= max(shaper, NEGLIGIBLE_UM):
+        if compared and ours >= max(least_ratio * shaper, NEGLIGIBLE_UM):
             yield (
                 f"{SHAPER_IS_BETTER}: {self.shaper.label} alone would leave {um_text(shaper)} µm "
                 f"rms of contour error, this file {um_text(ours)} µm. "

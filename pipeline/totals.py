@@ -127,6 +127,13 @@ class Totals:
         """The part of it that extrudes."""
         return max(self.passed_s - self.put_back_s, 0.0)
 
+    @property
+    def compensated_share(self) -> float:
+        """Share of the extruding time, of what was to be compensated, that is."""
+        chosen_s = self.extruding_s - self.left_out_extruding_s
+        left_s = self.put_back_s + self.left_alone_extruding_s
+        return max(1.0 - left_s / chosen_s, 0.0) if chosen_s > 0.0 else 0.0
+
     def left_out(self, where: str) -> Iterator[str]:
         """Yield warnings about what the options of the job left as sliced."""
         if where != "all":

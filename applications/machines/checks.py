@@ -32,9 +32,13 @@ __all__ = [
 
 _DEFAULT_HZ = 50.0
 _DEFAULT_ZETA = 0.07
+_RESONANCES_HZ, _DAMPING = (1.0, 500.0), (1e-3, 1.0)
 _ACCEL_ROOM, _SPEED_ROOM, _CORNERS = 1.5, 1.2, 6.0
 """Limits assumed for motors where none are stated: these multiples of the acceleration, speed and
 corner speed that the printer allows a file."""
+_MARLIN_ROOM, _MARLIN_MM_S2 = 3.0, 6000.0
+"""Multiple of the acceleration on Marlin, and up to where: with few short moves in its queue it
+does not reach a print's speed on 1.5 times a low limit, and every piece would stay as sliced."""
 _LEAST_STEP_MM_S = 20.0
 _ROUNDING = 1.001
 """Ratio up to which two limits count as equal."""
@@ -228,7 +232,22 @@ def not_followed(config: PrinterConfig) -> list[str]:
 
 
 def stated_axis(f_hz: float, zeta: float) -> dict[str, Any]:
-    """Return an unmeasured axis of one resonance; without a frequency (0), of 50 Hz."""
+    """Return an unmeasured axis of one resonance; without a frequency (0), of 50 Hz.
+
+    Raises
+    ------
+    ModelError
+        For a resonance or a damping ratio that no axis has.
+    """
+    for what, value, (least, most), unit in (
+        ("resonance", f_hz or _DEFAULT_HZ, _RESONANCES_HZ, " Hz"),
+        ("damping ratio", zeta, _DAMPING, ""),
+    ):
+        if not least <= value <= most:
+            raise ModelError(
+                f"a {what} of {value:g}{unit} was stated; it must be {least:g} to {most:g}{unit}: "
+                "give the one of the axis (--fx, --fy, --zeta, or the configuration's shaper)"
+            )
     return typed_in(f_hz or _DEFAULT_HZ, zeta).model_dump(mode="json", exclude_none=True)
 
 
@@ -239,11 +258,11 @@ def derived_envelope(machine: Machine) -> CommandLimits:
     state better values. `axes` are set if the printer has separate limits for X and Y; the motors
     of a CoreXY are assumed to follow what a file's diagonals need.
     """
-    x, y = (_borne(machine.firmware.allowance(axis)) for axis in ("x", "y"))
+    x, y = (_borne(machine, machine.firmware.allowance(axis)) for axis in ("x", "y"))
     least = {name: min(value, y[name]) for name, value in x.items()}
     if machine.kinematics == "corexy":
         # An integer, not below what a diagonal at the head's own limit needs.
-        accel = math.ceil(_ACCEL_ROOM * machine.firmware.motor_accel_mm_s2())
+        accel = math.ceil(_accel_borne(machine, machine.firmware.motor_accel_mm_s2()))
         return CommandLimits(**least, motors=MotorLimits(accel_mm_s2=accel))
     if machine.firmware.kind == "klipper":
         return CommandLimits(**least)
@@ -255,13 +274,20 @@ def derived_envelope(machine: Machine) -> CommandLimits:
     return CommandLimits(**least, axes=more)
 
 
-def _borne(allowed: AxisAllowance) -> dict[str, float]:
+def _borne(machine: Machine, allowed: AxisAllowance) -> dict[str, float]:
     step = _CORNERS * allowed.corner_mm_s
     return {
         "velocity_mm_s": _SPEED_ROOM * allowed.speed_mm_s,
-        "accel_mm_s2": _ACCEL_ROOM * allowed.accel_mm_s2,
+        "accel_mm_s2": _accel_borne(machine, allowed.accel_mm_s2),
         "speed_step_mm_s": min(max(step, _LEAST_STEP_MM_S), CommandLimits().speed_step_mm_s),
     }
+
+
+def _accel_borne(machine: Machine, allowed_mm_s2: float) -> float:
+    usual = _ACCEL_ROOM * allowed_mm_s2
+    if machine.firmware.kind != "marlin":
+        return usual
+    return max(usual, min(_MARLIN_ROOM * allowed_mm_s2, _MARLIN_MM_S2))
 
 
 def with_firmware(machine: Machine, section: dict[str, Any]) -> Machine:
@@ -300,9 +326,8 @@ def envelope_warnings(machine: Machine) -> list[str]:
         found["motors.accel_mm_s2"] = (motors[0], motors[1])
     return [
         f"{machine.name}: a command may ask the motors for {asked:.0f} mm/s2 (command.{place}), "
-        f"more than {_ACCEL_ROOM:g} times what the printer allows a file "
-        f"({most / _ACCEL_ROOM:.0f}): right if the motors were tested at that "
-        f"acceleration; otherwise put {most:.0f} there"
+        f"more than the {most:.0f} that the printer's own limits for a file suggest: right if the "
+        f"motors were tested at that acceleration; otherwise put {most:.0f} there"
         for place, (asked, most) in found.items()
     ]
 

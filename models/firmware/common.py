@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import Literal, NamedTuple
 
+from pydantic import model_validator
+
 from stillpath.models.document import Document, Finite, NonNegative, Positive
 
 __all__ = [
@@ -13,6 +15,10 @@ __all__ = [
     "FirmwareRetraction",
     "Hotend",
 ]
+
+
+_SPEEDS_MM_S, _ACCELS_MM_S2 = (1.0, 1e5), (1.0, 1e7)
+"""Beyond what moves a printer: with less a motion has no end, with more it cannot be computed."""
 
 
 class Hotend(Document):
@@ -62,6 +68,23 @@ class FirmwareFacts(Document):
     home_mm: tuple[Finite, Finite, Finite] | None = None
     """Where G28 leaves the axes, if the machine says; None: unknown after homing."""
     max_segments_per_s: Positive = 1000.0
+
+    @model_validator(mode="after")
+    def _can_print(self) -> FirmwareFacts:
+        """Refuse limits of X and Y, from whatever fields they follow, that are no printer's."""
+        axes: tuple[Literal["x", "y"], ...] = ("x", "y")
+        for axis in axes:
+            allowed = self.allowance(axis)
+            for what, value, (least, most), unit in (
+                ("speed", allowed.speed_mm_s, _SPEEDS_MM_S, "mm/s"),
+                ("acceleration", allowed.accel_mm_s2, _ACCELS_MM_S2, "mm/s2"),
+            ):
+                if not least <= value <= most:
+                    raise ValueError(
+                        f"the largest {what} of {axis.upper()} is {value:g} {unit}, not within "
+                        f"{least:g} to {most:g}; state what the printer's configuration says"
+                    )
+        return self
 
     @property
     def hotend(self) -> Hotend:

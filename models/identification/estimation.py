@@ -9,6 +9,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import next_fast_len, rfft
+from scipy.interpolate import CubicSpline
 from scipy.signal.windows import tukey
 
 from stillpath.models.arrays import Array
@@ -56,6 +57,8 @@ _LEVEL_UNKNOWN = "level not checked: nothing between 8 and 15 Hz follows the com
 _WEAKEST_DRIVE = 1e-5
 _MOST_POINTS = 4096
 _REST = 0.25
+_MOST_SD = 0.15
+"""Standard deviation, as a share of the response, up to which a drive with transients is used."""
 
 
 def estimate_response(
@@ -105,6 +108,13 @@ def estimate_aligned(
         raise ModelError(
             f"{log.source}: the log reaches {aligned.f_reached_hz:.1f} Hz of the sweep only; "
             "record the whole test"
+        )
+    shown_hz = 0.5 * aligned.rate_hz
+    if shown_hz <= aligned.f_reached_hz:
+        raise ModelError(
+            f"{log.source}: {aligned.rate_hz:g} samples per s show less than {shown_hz:g} Hz, and "
+            f"the test goes to {aligned.f_reached_hz:g} Hz; set a higher rate of the sensor, or "
+            f"give max_freq = {shown_hz - 2.0:.0f} to use what is there"
         )
     f_hz = np.arange(np.ceil(first / _STEP_HZ), np.floor(last / _STEP_HZ) + 1) * _STEP_HZ
     found = response_at(aligned, f_hz)
@@ -199,7 +209,7 @@ def estimate_driven(
     FrequencyResponse
         At the frequencies with at least -50 dB of the strongest drive.
     """
-    logs = _several(driven)
+    logs = [_uniform(log) for log in _several(driven)]
     records = []
     transient = not all(_rests(log.command) for log in logs)
     for log in logs:
@@ -212,6 +222,10 @@ def estimate_driven(
     half = max(*(reach * r.spacing_hz for r in records), 4.0 * _nyquist_hz(records) / _MOST_POINTS)
     f_hz = _driven_grid(records, half)
     found = local_response(records, f_hz, half, transient=transient)
+    if transient:
+        # Beside a sweep the transients explain the bins by themselves: coherent, but no response.
+        known = found.sd <= _MOST_SD * np.abs(found.response)
+        found = replace(found, coherence=np.where(known, found.coherence, 0.0))
     return _driven_response(logs, f_hz, found, label)
 
 
@@ -312,6 +326,16 @@ def _several(driven: DrivenLog | Sequence[DrivenLog]) -> tuple[DrivenLog, ...]:
     if len(axes) > 1:
         raise ModelError(f"logs of different axes ({', '.join(sorted(axes))}); one axis at a time")
     return logs
+
+
+def _uniform(log: DrivenLog) -> DrivenLog:
+    """Return the log at its usual sampling interval throughout, by cubic splines."""
+    steps = np.diff(log.time_s)
+    count = round(float(np.sum(steps) / np.median(steps))) + 1
+    time_s = np.linspace(log.time_s[0], log.time_s[-1], count)
+    columns = np.stack([log.command, log.measured], axis=1)
+    command, measured = CubicSpline(log.time_s, columns)(time_s).T
+    return replace(log, time_s=time_s, command=command, measured=measured)
 
 
 def _rests(values: Array) -> bool:

@@ -29,6 +29,14 @@ __all__ = [
 
 _KAISER_BETA = 6.0
 _WINDOW_S = 0.5
+_RANGES = {
+    "f_start_hz": ("min_freq", 0.5, 1000.0),
+    "accel_per_hz_mm_s": ("accel_per_hz", 0.1, 1e4),
+    "hz_per_s": ("hz_per_sec", 0.05, 100.0),
+    "sweeping_accel_mm_s2": ("sweeping_accel", 0.0, 1e5),
+    "sweeping_period_s": ("sweeping_period", 0.05, 1000.0),
+}
+"""Option, least and largest value: beyond, a test is no test, or takes all memory to regenerate."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -253,25 +261,18 @@ def _slow_wave(excitation: Excitation, end_s: float) -> tuple[Array, Array]:
 
 def _check(excitation: Excitation) -> None:
     e = excitation
-    positive = {
-        "f_start_hz": e.f_start_hz,
-        "accel_per_hz_mm_s": e.accel_per_hz_mm_s,
-        "hz_per_s": e.hz_per_s,
-    }
-    for name, value in positive.items():
-        if not (np.isfinite(value) and value > 0):
-            raise ModelError(f"excitation: {name} = {value:g} must be positive")
+    for name, (option, least, most) in _RANGES.items():
+        value = getattr(e, name)
+        if not least <= value <= most and not (value == 0 and name == "sweeping_period_s"):
+            raise ModelError(
+                f"excitation: {name} = {value:g} must be {least:g} to {most:g}; see {option} in "
+                "printer.cfg"
+            )
     if not e.f_start_hz < e.f_end_hz <= 1000.0:
         raise ModelError(
             f"excitation: f_end_hz = {e.f_end_hz:g} must lie above f_start_hz = "
             f"{e.f_start_hz:g} and at most at 1000 Hz; see min_freq and max_freq in printer.cfg"
         )
-    for name, value in (
-        ("sweeping_accel_mm_s2", e.sweeping_accel_mm_s2),
-        ("sweeping_period_s", e.sweeping_period_s),
-    ):
-        if not (np.isfinite(value) and value >= 0):
-            raise ModelError(f"excitation: {name} = {value:g} must not be negative")
     if (e.f_end_hz**2 - e.f_start_hz**2) / e.hz_per_s > 5e6:
         raise ModelError(
             f"excitation: hz_per_s = {e.hz_per_s:g} makes the test last "

@@ -358,11 +358,12 @@ class _AxisWork:
         self._spectra, left_out = of_one_test(self._spectra, self._axis)
         self._explanations = self._explained()
         found = self._from_spectra(frame_likely)
+        read = [note for one in self._used for note in one.measurement.notes]
         return replace(
             found,
             plants=self._rubbing(found.plants),
             notes=(*found.notes, *body_notes(self._friction_mm, None), *left_out),
-            warnings=(*found.warnings, phase_warning(self._axis, poor)),
+            warnings=(*found.warnings, phase_warning(self._axis, poor, read)),
         )
 
     def _explained(self) -> Explanations:

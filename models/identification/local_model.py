@@ -96,7 +96,9 @@ def local_response(
     spread = (inverse[:, :1] @ meat @ inverse[:, :, :1])[:, 0, 0].real
     total = energy / bins
     share = np.divide(noise, total, out=np.ones_like(total), where=total > 0)
-    return LocalResponse(solution[:, 0], np.sqrt(noise * spread), np.clip(1.0 - share, 0.0, 1.0))
+    # Rounding makes the variance of a band that nothing drives negative: its error is unknown.
+    sd = np.sqrt(np.where(spread >= 0.0, noise * spread, np.inf))
+    return LocalResponse(solution[:, 0], sd, np.clip(1.0 - share, 0.0, 1.0))
 
 
 def bins_needed(records: int, *, transient: bool) -> int:

@@ -11,6 +11,7 @@ from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.estimation import plateau_gain
 from stillpath.models.identification.nozzle import Frame
+from stillpath.models.identification.readers.checks import RANGE_ENDED
 from stillpath.models.identification.types import Excitation, Fit, FrequencyResponse, Spectrum
 from stillpath.models.plants import RelativeModesSpec
 
@@ -144,14 +145,22 @@ def poorly_explained(fit: Fit) -> bool:
     return not fit.magnitude_only and _POOR < fit.residual <= _USELESS
 
 
-def phase_warning(axis: str, poor: Fit) -> str:
-    """Say why of logs only the magnitude is used."""
+def phase_warning(axis: str, poor: Fit, notes: Sequence[str]) -> str:
+    """Say why of logs with these notes only the magnitude is used."""
+    clipped = any(RANGE_ENDED in note for note in notes)
+    cause, remedy = (
+        ("the sensor's range ended", "Set a larger range, or test with a lower accel_per_hz")
+        if clipped
+        else (
+            "how the axis moves depends on how far it moves (much friction, play)",
+            "Look for what rubs or is loose",
+        )
+    )
     return (
         f"axis {axis.upper()}: the best model misses {poor.residual:.0%} of what the logs say, "
-        f"{_POOR:.0%} at most is to be expected: how the axis moves depends on how far it moves "
-        "(much friction, play). So only the size of the vibrations is used, as from a resonance "
-        "table, and the compensation is more cautious. Look for what rubs or is loose, and measure "
-        "again"
+        f"{_POOR:.0%} at most is to be expected: {cause}. So only the size of the vibrations is "
+        f"used, as from a resonance table, and the compensation is more cautious. {remedy}, and "
+        "measure again"
     )
 
 

@@ -32,6 +32,7 @@ from stillpath.pipeline.advising.messages import (
     kept_beyond,
     shaper_warnings,
     stored_settings,
+    withdrawn,
 )
 from stillpath.pipeline.advising.reading import FirstReading
 from stillpath.pipeline.clock import StageClock
@@ -70,6 +71,8 @@ _BLOCK_BYTES = 1 << 17
 _ROUNDS = 7
 _TOLERANCE = 1.001
 _ROUNDING_S = 1e-3
+_SETTING_S = 0.05
+"""Most that setting a shaper takes: the firmware finishes all moves before."""
 _UNDO = (
     f"Moves are untouched, and so are the slicer's times in the file; deleting the lines that hold "
     f"{MARK.decode()!r} gives back the original."
@@ -129,6 +132,7 @@ class _Job:
     ) -> None:
         self._source, self._spool = source, spool
         self._machine, self._options = machine, options
+        self._withdrawn: list[str] = []
         self._say = ProgressReports(progress).say
         self._clock = StageClock()
         self._adapter = adapter(machine)
@@ -243,11 +247,12 @@ class _Job:
             if attempt + 2 < _ROUNDS and over and choice.mended(over):
                 continue
             worse = bool(over) or _rms_um(errors) > _TOLERANCE * _rms_um(was)
-            worse |= written.time_s > was_s + _ROUNDING_S
+            slower = written.time_s > was_s + _ROUNDING_S + _SETTING_S * writer.shapers_set
             unbudgeted = self._options.budget_um is None and attempt + 1 < _ROUNDS
             # No better than as sliced: withdraw the advice.
-            if not (unbudgeted and worse and choice.withdrawn()):
+            if not (unbudgeted and (worse or slower) and choice.withdrawn()):
                 break
+            self._withdrawn = [withdrawn(written.time_s - was_s, less_exact=worse)]
         return writer, errors
 
     def _bound_um(self, feature: int, was: dict[int, ClassError]) -> float:
@@ -374,7 +379,7 @@ class _Job:
             peak_accel_mm_s2=max((f.accel_mm_s2 or 0.0 for f in figures.features), default=0.0),
             extruding_s=sum(group.seconds for group in features),
             warnings=[*self._doubts, *asked.warnings, *warnings, *advised.warnings()],
-            notes=[*self._notes, *kept_beyond(figures.features), _UNDO],
+            notes=[*self._withdrawn, *self._notes, *kept_beyond(figures.features), _UNDO],
             layers=_merged(original.layers(), advised.layers()),
             features=features,
             track=advised.track(),

@@ -54,6 +54,8 @@ class AdviceWriter:
 
     Attributes
     ----------
+    lines, shapers_set : int
+        Inserted lines, and places at which a shaper of ours is set.
     shaper_left : bool
         At the end the printer's previous shaper was unknown: ours stays, at least in part.
     """
@@ -77,7 +79,7 @@ class AdviceWriter:
             rb"\b%s\b(?:(?![GMT]\d)[^;])*" % adviser.shaper_word.encode(), re.IGNORECASE
         )
         self._rests = True
-        self.lines = 0
+        self.lines = self.shapers_set = 0
         self.shaper_left = False
 
     def header(self) -> bytes:
@@ -189,6 +191,7 @@ class AdviceWriter:
         if wanted is None or wanted == self._shaper or (prints and not self._rests):
             return b""
         self._shaper, self._shaped = wanted, True
+        self.shapers_set += 1
         layer = f" from layer {self._layer} on" if self._layer > 0 else ""
         lines = self._adviser.shaper_lines(wanted)
         return b"".join(self._line(line, f"shaper{layer}") for line in lines)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from stillpath.pipeline.result import AdvisedFeature
 
-__all__ = ["beyond_bounds", "kept_beyond", "shaper_warnings", "stored_settings"]
+__all__ = ["beyond_bounds", "kept_beyond", "shaper_warnings", "stored_settings", "withdrawn"]
 
 
 def shaper_warnings(unmodelled: Sequence[str], *, none_known: bool, left: bool) -> list[str]:
@@ -101,3 +101,12 @@ def kept_beyond(features: Sequence[AdvisedFeature]) -> list[str]:
     if not names:
         return []
     return [f"Above its bound, but not slowed below what the file asks for: {', '.join(names)}."]
+
+
+def withdrawn(longer_s: float, *, less_exact: bool) -> str:
+    """Return the note that a file keeps its own settings, as advice did not improve it."""
+    why = "be less exact" if less_exact else f"take {longer_s:.2f} s longer"
+    return (
+        f"Advice was withdrawn: with it, the file would {why}. A budget (budget_um) says how much "
+        "may be lost."
+    )

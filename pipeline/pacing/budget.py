@@ -31,7 +31,7 @@ from stillpath.gcode.types import Moves
 from stillpath.models.machine import Machine
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.pipeline.measuring.set_errors import ErrorSum
-from stillpath.pipeline.options import Options
+from stillpath.pipeline.options import LEAST_BUDGET_UM, Options
 from stillpath.pipeline.pacing.pace_search import PaceChoice, allowed_um, search
 from stillpath.pipeline.pacing.pace_trials import Factors, PaceTrials, compensated, paces, shaped
 from stillpath.pipeline.pacing.samples import FileSamples, Sample
@@ -277,13 +277,14 @@ class SpeedBudget:
             error = found.worst
             if error.rms_um <= _ABOVE * allowed_um(one, self.budget_um):
                 continue
-            raised = self._mean_factor(one) > 1.001
             remedy = (
-                "give a smaller budget"
-                if raised
-                else "nothing of it is quicker than in the file: its own accelerations are too high"
-                " for the budget"
+                "nothing of it is quicker than in the file: its own accelerations are too high for "
+                "the budget"
             )
+            if self._mean_factor(one) > 1.001:
+                remedy = "give a smaller budget"
+                if self.budget_um <= LEAST_BUDGET_UM:
+                    remedy = "no smaller one can be given: without a budget it keeps its speed"
             warnings.append(
                 f"The contour error of {_name(one, names)} is {error.rms_um:.2f} µm (rms, worst "
                 f"plant of the set), above the budget of {self.budget_um:g} µm; {remedy}."

@@ -36,7 +36,7 @@ _BODY = {
     }
 }
 
-Hertz = Annotated[float | None, Query(ge=1, le=1000, allow_inf_nan=False)]
+Hertz = Annotated[float | None, Query(ge=1, le=500, allow_inf_nan=False)]
 
 router = APIRouter(prefix="/v1/machines", tags=["machines"])
 

@@ -7,7 +7,9 @@ from pathlib import Path
 import pytest
 
 from stillpath.cli.main import run
+from stillpath.models.machine import CommandLimits
 from stillpath.models.store import read_machine
+from tests.compensating import compensated
 
 M503 = """\
 Send: M503
@@ -182,10 +184,28 @@ def test_the_command_has_room_above_what_the_printer_allows(make, capsys) -> Non
     assert command.accel_mm_s2 > 30000
 
 
+@pytest.mark.parametrize("room", [None, 1.5])
+def test_low_limits_leave_enough_for_the_print_s_speed(room, make, capsys, tmp_path) -> None:
+    """Marlin's short queue brakes from no more; a machine that was made with less says why."""
+    make(M503.replace("J0.08", "X8 Y8 Z0.4 E5"), "--fx", "45", "--fy", "29")
+    machine = stored(capsys)
+    if room is not None:
+        command = CommandLimits(accel_mm_s2=room * 500.0)
+        machine = machine.model_copy(update={"command": command})
+    ring = "G1 X80 Y60 E.8 F6000\nG1 X80 Y80 E.8\nG1 X60 Y80 E.8\nG1 X60 Y60 E.8\n"
+    folder = tmp_path / "printed"
+    folder.mkdir()
+    text = f"G28\nM83\nG1 Z1 F600\nG1 X60 Y60 F6000\n{2 * ring}"
+    result, _ = compensated(text, folder, tmp_path / "cache", machine)
+    reasons = [one.reason for one in result.put_back]
+    assert len(reasons) == (0 if room is None else 1)
+    assert all("command.accel_mm_s2 (750) is low: measure" in reason for reason in reasons)
+
+
 def test_an_axis_that_may_more_bears_more(make, capsys) -> None:
     make(M503.replace("M204 P510", "M204 P3000"))
     command = stored(capsys).command
     # M201 X500 Y600, M203 X500 Y400
-    assert (command.accel_mm_s2, command.velocity_mm_s) == (750.0, 480.0)
-    assert (command.of("x").accel_mm_s2, command.of("x").velocity_mm_s) == (750.0, 600.0)
-    assert (command.of("y").accel_mm_s2, command.of("y").velocity_mm_s) == (900.0, 480.0)
+    assert (command.accel_mm_s2, command.velocity_mm_s) == (1500.0, 480.0)
+    assert (command.of("x").accel_mm_s2, command.of("x").velocity_mm_s) == (1500.0, 600.0)
+    assert (command.of("y").accel_mm_s2, command.of("y").velocity_mm_s) == (1800.0, 480.0)

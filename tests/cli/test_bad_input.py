@@ -62,6 +62,11 @@ def test_bad_files(name: str, where: str, tmp_path: Path, capsys: pytest.Capture
         ({"colour": "blue"}, "colour"),
         ({"axes": {}}, "axes"),
         ({"axes": "unstable"}, "pole"),
+        *(
+            ({"firmware": {"kind": "klipper", "planner": {name: value}}}, f"of X is {value:g} mm/s")
+            for name in ("max_velocity_mm_s", "max_accel_mm_s2")
+            for value in (1e30, 1e-3)
+        ),
     ],
 )
 def test_bad_machines(change: dict, word: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):

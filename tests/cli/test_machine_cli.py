@@ -277,6 +277,16 @@ def test_typed_in_resonances(store: MachineStore, config: Path):
     assert [(mode.f_hz, mode.zeta) for mode in modes] == [(70.0, 0.1), (55.0, 0.1)]
 
 
+@pytest.mark.parametrize("hertz", ["inf", "nan", "1e101", "501"])
+def test_resonances_that_are_none(store: MachineStore, config: Path, capsys, hertz: str):
+    assert machines("from-config", config, "--name", "mine", "--fx", hertz) == 2
+    assert "500" in capsys.readouterr().err
+    config.write_text(CONFIG + f"[input_shaper]\nshaper_freq_y: {hertz}\n")
+    assert machines("from-config", config, "--name", "mine") == 2
+    assert "shaper" in one_line(capsys)
+    assert store.names() == []
+
+
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [

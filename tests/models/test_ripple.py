@@ -115,6 +115,13 @@ class TestDocument:
         with pytest.raises(ValidationError, match="micrometres"):
             AxisRipple(sources=(source,))
 
+    def test_what_no_belt_has(self) -> None:
+        for amplitude_um in (5001.0, 1e300):
+            wave = RippleHarmonic(number=1, amplitude_um=amplitude_um, phase_deg=0.0)
+            source = RippleSource(name="belt", pitch_mm=2.0, enters="output", harmonics=(wave,))
+            with pytest.raises(ValidationError, match="at most 5000 is a ripple"):
+                AxisRipple(sources=(source,))
+
     def test_a_harmonic_twice(self) -> None:
         wave = RippleHarmonic(number=1, amplitude_um=2.0, phase_deg=0.0)
         with pytest.raises(ValidationError, match="twice"):

@@ -250,6 +250,7 @@ OTHER = ModesSpec(modes=(Mode(f_hz=40.0, zeta=0.1),)).model_dump()
         ({"grid": {"nodes": [NODE, {"plant": NODE["plant"]}]}}, "node 1 lacks z_mm"),
         ({"grid": {"nodes": [{"plant": NODE["plant"]}] * 2}}, "a grid needs positions"),
         ({"grid": {"nodes": [NODE, {"z_mm": 9, "plant": OTHER}]}}, "another structure"),
+        ({"grid": {"nodes": [NODE, {**NODE, "z_mm": 1e308}]}}, "z_mm"),
         (
             {"grid": {"nodes": [{"x_mm": x, "y_mm": x, "plant": OTHER} for x in (0, 9)]}},
             "no node at x 0, y 9 mm",

@@ -18,7 +18,7 @@ from stillpath.models.firmware.klipper import FirmwareShaper
 from stillpath.models.firmware.marlin import MarlinPlanner, MarlinShaper, PerAxis
 from stillpath.models.firmware.reprapfirmware import Drive
 from stillpath.models.machine import Machine
-from stillpath.models.plant_specs import ParametricMembers
+from stillpath.models.plant_specs import ParametricMembers, RelativeMode, RelativeModesSpec
 from stillpath.models.schedule import AxisSchedule, MassSchedule
 from stillpath.models.store import load_machine
 from stillpath.pipeline.advising.inserting import MARK
@@ -185,6 +185,24 @@ def test_without_a_budget_nothing_gets_worse_or_slower(tmp_path: Path, cache: Pa
         if feature.bound_um is not None:
             assert feature.after_um <= feature.before_um * 1.001
     assert result.time_s <= result.original_time_s
+
+
+@pytest.mark.parametrize(("f_hz", "pauses", "kept"), [(45.0, 1, True), (12.0, 20, False)])
+def test_where_setting_the_shaper_again_costs_too_much_it_is_said(
+    f_hz: float, pauses: int, kept: bool, tmp_path: Path, cache: Path
+) -> None:
+    """One setting after a pause of the file costs .02 s: advice once was withdrawn for that."""
+    nominal = RelativeModesSpec(modes=(RelativeMode(f_hz=f_hz, zeta=0.08, share=1.0),))
+    axes = {
+        axis: plants.model_copy(update={"nominal": nominal})
+        for axis, plants in machine_of(Klipper()).axes.items()
+    }
+    square = "G1 X80 Y60 E.8 F6000\nG1 X80 Y80 E.8\nG1 X60 Y80 E.8\nG1 X60 Y60 E.8\n"
+    text = "G28\nM83\nG1 X60 Y60 Z1\n" + square + pauses * "PAUSE\nG1 X61\nG1 X60\n" + square
+    result, _ = advise(text.encode(), tmp_path, machine_of(Klipper(), axes=axes), cache)
+    assert result.advice is not None
+    assert bool(result.advice.shapers) is kept
+    assert any("Advice was withdrawn" in note for note in result.notes) is not kept
 
 
 def test_the_printers_shaper_is_put_back(tmp_path: Path, cache: Path) -> None:

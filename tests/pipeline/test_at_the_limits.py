@@ -112,14 +112,39 @@ def test_what_is_left_alone_begins_where_it_was_switched_off(tmp_path: Path, cac
     assert f"from line {first} on" in told
 
 
-@pytest.mark.parametrize(("steps_per_mm", "told"), [(32.0, True), (400.0, False)])
+@pytest.mark.parametrize(
+    ("plants_of", "steps_per_mm", "reverted", "told"),
+    [
+        ("annex-k3", 32.0, True, True),
+        ("annex-k3", 400.0, False, False),
+        ("generic-bedslinger", 32.0, False, True),
+        ("generic-bedslinger", 400.0, False, False),
+    ],
+)
 def test_where_the_shaper_would_serve_better_it_is_said(
-    steps_per_mm: float, told: bool, tmp_path: Path, cache: Path
+    plants_of: str, steps_per_mm: float, reverted: bool, told: bool, tmp_path: Path, cache: Path
 ) -> None:
-    """Vertices on steps of .03 mm shake the printer more than the sliced file: that stays."""
-    result, _ = compensated(HEAD + RINGS, tmp_path, cache, with_steps(steps_per_mm))
-    assert ["as sliced" in one.reason for one in result.put_back] == [True] * told
+    """Vertices on steps of .03 mm shake the printer more than the sliced file: that stays.
+
+    A resonance that was typed in says what the command is, not that it reached the file.
+    """
+    axes = load_machine(plants_of).axes
+    machine = with_steps(steps_per_mm).model_copy(update={"axes": axes})
+    result, _ = compensated(HEAD + RINGS, tmp_path, cache, machine)
+    assert ["as sliced" in one.reason for one in result.put_back] == [True] * reverted
     assert any("shaper would serve this file better" in w for w in result.warnings) is told
+
+
+@pytest.mark.parametrize("name", ["ender3", "generic-bedslinger"])
+def test_what_is_not_compensated_has_the_range_of_the_sliced_file(
+    name: str, tmp_path: Path, cache: Path
+) -> None:
+    """It had the wide range of the command that was not written, and was called a shaper's."""
+    result, _ = compensated(HEAD + "; STILLPATH_OFF\n" + RINGS, tmp_path, cache, name)
+    before, after = (c for c in result.channels if c.name in ("before", "after"))
+    assert after.judged_rms_um == pytest.approx(before.judged_rms_um, rel=0.01)
+    assert after.contour_range_um == pytest.approx(before.contour_range_um, rel=0.01)
+    assert not any("typed in" in warning for warning in result.warnings)
 
 
 def fast(machine: Machine, speed_mm_s: float) -> Machine:

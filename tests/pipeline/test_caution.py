@@ -210,5 +210,9 @@ def test_what_motor_steps_add_is_much_the_same_for_all_plants() -> None:
     assert stepped[1].contour_range_um == pytest.approx(expected)
     assert smooth[0].contour_range_um == stepped[0].contour_range_um == pytest.approx((18.0, 24.0))
     assert stepped[2].contour_range_um is None
+    # Of 5 um, a hundredth of the time as sliced leaves 2: .16 of the square.
+    part = choice.ranged([channels[0], channel("after", 5.0)], steps=False, share=0.99)[1]
+    high_um = 5.0 * (0.84 * 10.0**2 + 0.16 * 1.2**2) ** 0.5
+    assert part.contour_range_um == pytest.approx((5.0 * (0.84 + 0.16 * 0.9**2) ** 0.5, high_um))
     # Friction holds an axis back by as much on a print that is twice as hard.
     assert [c.contour_rubbing_um for c in smooth] == [None, pytest.approx(50.0), None]

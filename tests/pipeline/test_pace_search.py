@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -148,6 +148,17 @@ def test_a_file_above_its_budget_is_written_anew() -> None:
     assert last.gentler(over) is None
     # What is as it was sliced cannot be milder.
     assert budget(wall=1.0, travel=1.0).gentler(over) is None
+
+
+@pytest.mark.parametrize(
+    ("budget_um", "remedy"), [(10.0, "give a smaller budget"), (0.5, "without a budget it keeps")]
+)
+def test_a_remedy_is_one_that_can_be_given(budget_um: float, remedy: str) -> None:
+    paces = replace(budget(wall=4.0), budget_um=budget_um)
+    over = {WALL: sums(12.0, 90.0)}
+    paces.correct(over)
+    (warning,) = paces.warnings(over, ["Perimeter"])
+    assert remedy in warning
 
 
 def test_every_plant_of_the_larger_set_is_judged() -> None:

@@ -6,12 +6,14 @@ import re
 
 import numpy as np
 
+from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.readers.checks import (
     check_alive,
     check_long,
     check_range,
     check_steady,
+    sensor_axes,
 )
 from stillpath.models.identification.readers.settings import ReadSettings
 from stillpath.models.identification.readers.tables import MOST_ROWS, Table
@@ -60,7 +62,7 @@ def read_klipper_log(table: Table, axis: str | None, settings: ReadSettings) -> 
     check_steady(values[:, 0], table)
     accel = values[:, 1:] * _UNITS[settings.acceleration_unit or "mm/s^2"]
     columns = dict(zip("xyz", accel.T, strict=True))
-    notes = (*check_alive(columns, table, axis, settings.sensor_axis), *check_range(columns))
+    notes = _notes(columns, table, axis, settings)
     return AccelerationLog(values[:, 0], accel, axis, table.source, (*table.notes, *notes))
 
 
@@ -87,8 +89,17 @@ def read_m956(table: Table, axis: str | None, settings: ReadSettings) -> Acceler
     for i, name in enumerate(table.names[1:], start=1):
         accel[:, "xyz".index(name)] = values[:, i] * _UNITS[settings.acceleration_unit or "g"]
     columns = dict(zip("xyz", accel.T, strict=True))
-    notes = (*check_alive(columns, table, axis, settings.sensor_axis), *check_range(columns))
+    notes = _notes(columns, table, axis, settings)
     return AccelerationLog(values[:, 0] / rate_hz, accel, axis, table.source, (_NO_TEST, *notes))
+
+
+def _notes(
+    columns: dict[str, Array], table: Table, axis: str | None, settings: ReadSettings
+) -> tuple[str, ...]:
+    """Check what the sensor measured."""
+    along = sensor_axes(settings.axis or axis, settings.sensor_axis)
+    alive = check_alive(columns, table, axis, settings.sensor_axis)
+    return *alive, *check_range(columns, table.source, along)
 
 
 def _rate_hz(table: Table) -> float:

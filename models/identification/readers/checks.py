@@ -2,19 +2,34 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.readers.tables import Table
 
-__all__ = ["check_alive", "check_long", "check_range", "check_rising", "check_steady"]
+__all__ = [
+    "RANGE_ENDED",
+    "check_alive",
+    "check_long",
+    "check_range",
+    "check_rising",
+    "check_steady",
+    "sensor_axes",
+]
+
+RANGE_ENDED = "its range ended"
+"""Part of the warning, and of the refusal."""
 
 _RATES_HZ = (10.0, 1e6)
 _LONGEST_S = 3600.0
 _NEXT, _FINE, _OFTEN = 0.02, 3, 20
 """Saturation: the share of the range beside an extreme that is examined, the sensor steps that it
 must contain, and the most samples that may lie at the extreme."""
+_MOST_STOPPED = 0.005
+"""Share of the samples at an extreme up to which a recording is used, with a warning."""
 _GAP_SAMPLES = 2.5
 """Two periods are one lost sample, which is accepted; half a period allows for jitter."""
 
@@ -99,7 +114,7 @@ def check_alive(
             f"{table.source}: every column of the sensor is constant "
             f"({_listed(dead)}): it did not measure; check its wiring and measure again"
         )
-    for name in _along(axis, sensor_axis):
+    for name in sensor_axes(axis, sensor_axis):
         if name in columns and name not in recorded:
             raise ModelError(
                 f"{table.source}: the sensor's {name} was not recorded, but axis {axis} was "
@@ -113,29 +128,50 @@ def check_alive(
     return (f"the sensor's {_listed(dead)} is constant",) if dead else ()
 
 
-def check_range(columns: dict[str, Array]) -> tuple[str, ...]:
+def check_range(
+    columns: dict[str, Array], source: str = "", along: Sequence[str] = ()
+) -> tuple[str, ...]:
     """Return a warning if a sensor's readings stop at a value that they reach often.
 
     An extreme is rare: where more samples lie on it than in the next part of the range, the
     sensor's own range ended there.
+
+    Parameters
+    ----------
+    along : sequence of str
+        Columns that a machine is identified from.
+
+    Raises
+    ------
+    ModelError
+        If one of these often lies there, again and again: no test would tell its damping.
     """
+    found = []
     for name, values in columns.items():
         for side in (1.0, -1.0):
             up = side * values
             top = float(up.max())
             below = up[(up < top) & (up > top - _NEXT * float(np.ptp(up)))]
-            often = int(np.count_nonzero(up == top))
-            if often > max(_OFTEN, 2 * len(below)) and len(np.unique(below)) >= _FINE:
-                text = (
-                    f"warning: the sensor's {name} stops at {side * top:.6g} mm/s^2, {often} "
-                    "samples lie there: its range ended, and damping comes out too large; test "
-                    "with a lower accel_per_hz, or set a larger range"
-                )
-                return (text,)
-    return ()
+            there = up == top
+            often = int(np.count_nonzero(there))
+            if often <= max(_OFTEN, 2 * len(below)) or len(np.unique(below)) < _FINE:
+                continue
+            unit = " mm/s^2" if name in "xyz" else ""
+            text = (
+                f"the sensor's {name} stops at {side * top:.6g}{unit}, {often} samples lie "
+                f"there: {RANGE_ENDED}, and damping comes out too large; test with a lower "
+                "accel_per_hz, or set a larger range"
+            )
+            # Something that came to rest at its extreme lies there once, for long.
+            times = np.count_nonzero(there[1:] & ~there[:-1])
+            if name in along and often > _MOST_STOPPED * len(up) and times > _OFTEN:
+                raise ModelError(f"{source}: {text}")
+            found.append(f"warning: {text}")
+    return tuple(found[:1])
 
 
-def _along(axis: str | None, sensor_axis: str | None) -> tuple[str, ...]:
+def sensor_axes(axis: str | None, sensor_axis: str | None) -> tuple[str, ...]:
+    """Return the sensor's columns that take part in a test of an axis, or of a direction."""
     if sensor_axis is not None:
         return (sensor_axis,)
     if axis is None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from stillpath.models.errors import ModelError
-from stillpath.models.identification.readers.checks import check_long, check_steady
+from stillpath.models.identification.readers.checks import check_long, check_range, check_steady
 from stillpath.models.identification.readers.settings import ReadSettings
 from stillpath.models.identification.readers.tables import MOST_ROWS, Table
 from stillpath.models.identification.types import DrivenLog
@@ -31,7 +31,7 @@ def read_drives(table: Table, axis: str | None, settings: ReadSettings) -> tuple
     Raises
     ------
     ModelError
-        For a column that is missing or dead, and gaps in time.
+        For a column that is missing or dead, gaps in time, and a sensor whose range ended.
     """
     columns = (
         _chosen(settings.time_column, _COLUMNS[0]),
@@ -74,7 +74,8 @@ def _log(table: Table, chosen: np.ndarray, values: np.ndarray, axis: str | None)
             f"{table.source}: command and measurement are the same numbers"
             f"{f' for axis {axis}' if axis else ''}: choose the column of what followed"
         )
-    return DrivenLog(time_s, command, measured, axis, table.source, table.notes)
+    notes = check_range({"measurement": measured}, table.source, ("measurement",))
+    return DrivenLog(time_s, command, measured, axis, table.source, (*table.notes, *notes))
 
 
 def _chosen(column: str | int | None, usual: str) -> str | int:

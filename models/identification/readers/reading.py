@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import re
 from pathlib import Path
 
@@ -28,6 +29,8 @@ __all__ = ["LARGEST_BYTES", "read_content", "read_measurements"]
 LARGEST_BYTES = 200_000_000
 _LARGEST_MODEL_BYTES = 16_000_000
 _HEAD_BYTES = 16_384
+_UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+"""What spreadsheets call Unicode text."""
 
 _DIRECTION = r"-?\d+\.\d+,-?\d+\.\d+(?:,-?\d+\.\d+)?"
 _KLIPPER_NAME = re.compile(
@@ -77,6 +80,8 @@ def read_content(
     """Read the content of a file called `name`; see `read_measurements`."""
     settings = settings or ReadSettings()
     content = unpacked(content, name, LARGEST_BYTES)
+    if content[:2] in _UTF16:
+        content = content.decode("utf-16", errors="replace").encode()
     if not content.strip():
         raise ModelError(f"{name}: the file is empty")
     named = _axes_in_name(name)

@@ -7,6 +7,7 @@ import re
 from datetime import date
 from typing import Annotated, Literal, NamedTuple
 
+import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from stillpath.models.document import Document, NonNegative, Positive
@@ -36,6 +37,9 @@ _KLIPPER = {
 """What users call them: options of [resonance_tester]."""
 _OLD = {"accel_per_hz_mm_s": 75.0, "f_end_hz": 10000.0 / 75.0, "sweeping_accel_mm_s2": 0.0}
 _LEAST_END_HZ, _END_DIFFERS_HZ = 40.0, 8.0
+_BESIDE_HZ, _FALL = 15.0, 100.0
+"""A test's third harmonic has 1/243 of the density of its fundamental; no resonance falls by 100
+within so few Hz."""
 _DIAGONAL = re.compile(r"-?\d+(\.\d+)?,-?\d+(\.\d+)?(,-?\d+(\.\d+)?)?")
 _DAY = re.compile(r"\d{4}-\d\d-\d\d")
 _DATE = re.compile(r"(?<!\d)(20\d\d)[-_]?(\d\d)[-_]?(\d\d)(?!\d)")
@@ -243,8 +247,20 @@ def _end_of_range(spectrum: Spectrum, default_hz: float) -> float | None:
     least = float(spectrum.f_hz[-1]) / 1.5
     if least < _LEAST_END_HZ or abs(least - default_hz) < _END_DIFFERS_HZ:
         return None
+    if _falls(spectrum, default_hz):
+        return None
     whole = 5.0 * math.ceil(least / 5.0 - 1e-9)
     return whole if whole < least + bin_hz / 1.5 else least
+
+
+def _falls(spectrum: Spectrum, end_hz: float) -> bool:
+    """Return whether the density falls as at the end of a test, where only harmonics go on."""
+    density = np.sum(list(spectrum.psd.values()), axis=0)
+    away = spectrum.f_hz - end_hz
+    inside, outside = (away >= -_BESIDE_HZ) & (away <= 0.0), (away >= 5.0) & (away <= _BESIDE_HZ)
+    if not inside.any() or not outside.any():
+        return False
+    return bool(np.median(density[inside]) > _FALL * np.median(density[outside]))
 
 
 def _era(made: date | None, settings: ReadSettings) -> str:

@@ -129,10 +129,12 @@ class Table:
                 value = _number(fields[column])
                 if value is None or not abs(value) < _LARGEST:
                     name = self.names[column] if self.names else f"column {column}"
+                    remedy = "remove the line or measure again"
+                    if "," in fields[column]:
+                        remedy = "decimal commas are not read: export the file with points"
                     return self.at(
                         i,
-                        f"{name} is {fields[column].strip()!r:.60}, not a finite number; "
-                        "remove the line or measure again",
+                        f"{name} is {fields[column].strip()!r:.60}, not a finite number; {remedy}",
                     )
         return ModelError(f"{self.source}: the rows cannot be read as numbers")
 
@@ -180,6 +182,9 @@ def as_table(text: str, source: str) -> Table:
         header = rows.pop(0)
         lines.pop(0)
     delimiter = _delimiter(rows[0] if rows else header)
+    if delimiter == "," and "," not in header:
+        # Commas within numbers: the header tells what is between them.
+        delimiter = _delimiter(header) or delimiter
     if not header and rows:
         header = _commented_header(comments, delimiter, len(rows[0].split(delimiter)))
     table = Table(

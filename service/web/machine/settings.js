@@ -23,7 +23,7 @@ export function settingsPanel({ machine, signal }) {
   const name = h("input", { type: "text", id: "settings-name", required: true, ...NAME, autocomplete: "off", spellcheck: "false", "aria-describedby": "settings-name-hint" });
   const travel = h("input", { type: "text", id: "travel", pattern: TRAVEL, placeholder: "235x235x250", "aria-describedby": "travel-hint" });
   const kinematics = h("select", { id: "kinematics" }, [["cartesian", "Cartesian"], ["corexy", "CoreXY"]].map(([value, words]) => h("option", { value }, words)));
-  const [fx, fy] = ["x", "y"].map((axis) => h("input", { type: "number", id: `f${axis}`, min: "1", max: "1000", step: "any", placeholder: "as the file says" }));
+  const [fx, fy] = ["x", "y"].map((axis) => h("input", { type: "number", id: `f${axis}`, min: "1", max: "500", step: "any", placeholder: "as the file says" }));
   const marlin = h("div", { hidden: true },
     h("div.fields", null,
       field("travel", "How far X, Y and Z reach, mm", travel, "M503 does not say it."),

@@ -185,6 +185,14 @@ def test_a_soft_axis_with_a_noisy_sensor_is_used_where_it_follows() -> None:
     np.testing.assert_allclose(np.abs(found.response[used]), truth, rtol=0.1)
 
 
+def test_a_sensor_that_is_too_slow_for_the_test_is_named() -> None:
+    log = replace(measured(MODES, NEW, sensor=Sensor(rate_hz=200.0)), source="raw_data_x.csv")
+    with pytest.raises(ModelError, match=r"raw_data_x\.csv: 200 samples per s .* max_freq = 98 to"):
+        estimate_response(log, NEW)
+    short = replace(NEW, f_end_hz=98.0)
+    assert estimate_response(log, short).f_hz[-1] == pytest.approx(97.0)
+
+
 def test_a_level_that_cannot_be_checked_is_noted() -> None:
     high = replace(SHORT, f_start_hz=20.0, f_end_hz=60.0)
     found = estimate_response(measured(MODES, high), high)
@@ -220,6 +228,41 @@ def test_recorded_drives_give_the_response_of_python_control(logs: int) -> None:
     assert np.mean(found.coherence[strong] > 0.95) > 0.95
     assert (found.axis, found.label) == ("x", "noise")
     assert found.source.startswith("log0.csv")
+
+
+@pytest.mark.parametrize(("fade_s", "rest_s"), [(0.0, 0.0), (0.5, 0.0), (0.5, 0.5), (0.0, 0.2)])
+def test_a_sweep_without_long_rests_is_coherent_only_where_it_drives(
+    fade_s: float, rest_s: float
+) -> None:
+    """Transients explained all bins outside the sweep, and the first noise became a mode."""
+    rate_hz, last_hz, lasts_s = 1000.0, 110.0, 60.0
+    rest = np.zeros(round(rest_s * rate_hz))
+    t = np.arange(round(lasts_s * rate_hz)) / rate_hz
+    phase = 2 * np.pi * (5.0 * t + 0.5 * (last_hz - 5.0) / lasts_s * t**2)
+    fade = np.clip(np.minimum(t, lasts_s - t) / max(fade_s, 1e-9), 0.0, 1.0)
+    command = np.concatenate([rest, fade * np.sin(phase), rest])
+    _, plant = driven_log(1, 0)
+    answer = control.forced_response(plant, inputs=command).outputs
+    noise = np.random.default_rng(9).normal(size=len(answer))
+    answer = answer + 0.01 * np.std(answer) * noise
+    log = DrivenLog(np.arange(len(answer)) / rate_hz, command, answer, "x")
+    found = estimate_driven(log)
+    used = found.coherence >= 0.95
+    assert np.all(found.sd[used] <= 0.15 * np.abs(found.response[used]))
+    assert np.mean(used[(found.f_hz > 6.0) & (found.f_hz < 90.0)]) > 0.97
+
+
+def test_a_sampling_interval_that_changes_is_no_other_frequency() -> None:
+    """The mean rate stretched both parts of the record, and a wrong response was coherent."""
+    log, plant = driven_log(40_000, 5, noise=0.0)
+    smooth = np.convolve(log.command, np.hanning(12) / 6.0, mode="same")
+    answer = control.forced_response(plant, inputs=smooth).outputs
+    kept = np.arange(40_000)
+    kept = kept[(kept < 20_000) | (kept % 2 == 0)]
+    found = estimate_driven(DrivenLog(log.time_s[kept], smooth[kept], answer[kept], "x"))
+    at = (found.f_hz > 5.0) & (found.f_hz < 100.0)
+    truth = plant(np.exp(2j * np.pi * found.f_hz[at] / 1000))
+    assert np.quantile(np.abs(found.response[at] / truth - 1.0), 0.95) < 0.02
 
 
 @pytest.mark.parametrize("at_rest", [True, False])

@@ -158,12 +158,12 @@ def test_kernel_has_unit_area_and_its_published_bandwidth() -> None:
 @pytest.mark.parametrize(
     ("field", "value"),
     [
-        ("f_start_hz", 0.0),
+        *(("f_start_hz", value) for value in (0.0, 1e-6)),
         ("f_end_hz", float("nan")),
-        ("accel_per_hz_mm_s", -1.0),
-        ("hz_per_s", 1e-6),
-        ("sweeping_accel_mm_s2", -400.0),
-        ("sweeping_period_s", float("inf")),
+        *(("accel_per_hz_mm_s", value) for value in (-1.0, 1e9)),
+        *(("hz_per_s", value) for value in (1e-6, 1e6)),
+        *(("sweeping_accel_mm_s2", value) for value in (-400.0, 1e300)),
+        *(("sweeping_period_s", value) for value in (float("inf"), 1e-9)),
     ],
 )
 def test_parameters_that_make_no_test_are_named(field: str, value: float) -> None:

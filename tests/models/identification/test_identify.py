@@ -15,6 +15,7 @@ from stillpath.models.errors import ModelError
 from stillpath.models.identification.conditioned import Tested, of_one_test
 from stillpath.models.identification.conditions import Condition
 from stillpath.models.identification.identify import Measured, identify
+from stillpath.models.identification.messages import phase_warning
 from stillpath.models.identification.modal_fit import fit_modes
 from stillpath.models.identification.prompt import prompt
 from stillpath.models.identification.readers import ReadSettings, read_content
@@ -248,9 +249,38 @@ def test_a_log_of_m956_without_a_test() -> None:
 @pytest.mark.slow
 def test_a_sensor_whose_range_ended() -> None:
     log = quick_log("x")
-    most = 0.7 * float(np.abs(log.accel_mm_s2[:, 0]).max())
-    found = one(raw_file(replace(log, accel_mm_s2=np.clip(log.accel_mm_s2, -most, most))))
+    largest = float(np.abs(log.accel_mm_s2[:, 0]).max())
+
+    def clipped(share: float) -> InputFile:
+        accel = np.clip(log.accel_mm_s2, -share * largest, share * largest)
+        return raw_file(replace(log, accel_mm_s2=accel))
+
+    found = one(clipped(0.9))
     assert sum("the sensor's x stops at" in w for w in found.warnings) == 1
+    # With more of it, damping came out up to three times too large, and friction was blamed.
+    with pytest.raises(ModelError, match=r"csv: the sensor's x stops at .* range ended"):
+        one(clipped(0.7))
+
+
+def test_a_sensor_whose_range_ended_in_a_recorded_drive() -> None:
+    t = np.arange(8000) / 1000.0
+    command = np.sin(2 * np.pi * (5.0 + 3.0 * t) * t)
+    for most, words in ((0.7, "measurement stops at 0.7,"), (2.0, None)):
+        columns = np.stack([t, command, np.clip(0.9 * command, -most, most)], axis=1)
+        rows = "".join(f"{at_s:.3f},{u:.4f},{y:.4f}\n" for at_s, u, y in columns)
+        file = InputFile("drive_x.csv", f"time_s,cmd_acc,meas_acc\n{rows}".encode())
+        if words is None:
+            (driven,) = read(file)
+            assert driven.measurement.notes == ()
+        else:
+            with pytest.raises(ModelError, match=words):
+                read(file)
+
+
+@pytest.mark.parametrize("notes", [(), ("warning: the sensor's x stops at 9: its range ended",)])
+def test_friction_is_not_blamed_for_a_sensor_whose_range_ended(notes: tuple[str, ...]) -> None:
+    poor = replace(one(raw_file(quick_log("x"))).fit, residual=0.3)
+    assert ("friction" in phase_warning("x", poor, notes)) is not bool(notes)
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ import pytest
 from pydantic import ValidationError
 
 from stillpath.models.errors import ModelError
+from stillpath.models.identification.excitation import drive_spectrum
 from stillpath.models.identification.readers import (
     ReadSettings,
     date_in_name,
@@ -64,6 +65,20 @@ def test_range_by_where_the_table_ends(max_freq: float, last_hz: float, expected
     old = ReadSettings(firmware_date=date(2023, 1, 1))
     assert excitation_for(table, old).f_end_hz == pytest.approx(10000 / 75)
     assert excitation_for(table, ReadSettings(f_end_hz=90)).f_end_hz == 90.0
+
+
+def test_a_table_wider_than_its_test_keeps_the_default() -> None:
+    """The density says where the test ended: to 397 Hz, 265 were believed."""
+    f_hz = np.arange(0.0, 398.0, 1.0)
+    density = drive_spectrum(NEW, f_hz) + 1.0
+    for max_freq, table in (
+        (135.0, Spectrum(f_hz, {"x": density}, "x", "resonances_x_20260101.csv")),
+        (265.0, Spectrum(f_hz, {"x": np.square(f_hz)}, "x", "resonances_x_20260101.csv")),
+    ):
+        assert excitation_for(table).f_end_hz == max_freq
+        notes = excitation_notes(table)
+        assert any("so max_freq is" in note for note in notes) == (max_freq == 265.0)
+        assert any("max_freq 135" in note for note in notes) == (max_freq == 135.0)
 
 
 def test_file_before_settings_before_defaults() -> None:

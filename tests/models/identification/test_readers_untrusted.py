@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.readers import ReadSettings, read_content, read_measurements
 from stillpath.models.identification.readers.reading import LARGEST_BYTES
-from stillpath.models.identification.types import Measurement
+from stillpath.models.identification.types import DrivenLog, Measurement
 
 RNG = np.random.default_rng(7)
 
@@ -103,6 +103,21 @@ def test_every_cut_is_read_or_refused(name: str) -> None:
     for size in range(0, len(whole), max(1, len(whole) // 60)):
         with contextlib.suppress(ModelError):
             assert read_content(whole[:size], name)
+
+
+@pytest.mark.parametrize("delimiter", [";", "\t"])
+def test_what_spreadsheets_write(delimiter: str) -> None:
+    """Tables in UTF-16 are read; decimal commas have a message of their own."""
+    at = np.arange(100)
+    rows = [("time_s", "cmd_acc", "meas_acc")]
+    rows += [(f"{0.01 * k:.2f}", f"{k % 7:.1f}", f"{k % 5:.1f}") for k in at]
+    text = "\r\n".join(delimiter.join(row) for row in rows) + "\r\n"
+    for encoding in ("utf-8", "utf-16"):
+        (driven,) = read_content(text.encode(encoding), "drive_x.csv")
+        assert isinstance(driven, DrivenLog)
+        np.testing.assert_allclose(driven.time_s, 0.01 * at)
+    with pytest.raises(ModelError, match=r"line 2: time_s is '0,00', .*: export the file with po"):
+        read_content(text.replace(".", ",").encode(), "drive_x.csv")
 
 
 def test_files_that_are_not_read(tmp_path: Path) -> None:
