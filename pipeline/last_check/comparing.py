@@ -296,7 +296,7 @@ class LastCheck:
         if (
             wanted is not None
             and is_same(code, wanted.code)
-            and (not in_doubt or self._stands_before(wanted))
+            and (not in_doubt or self._stands_before(wanted, held_back=held_back))
         ):
             compared = wanted.kind is Kind.RESTS and not held_back
             if compared:
@@ -314,11 +314,18 @@ class LastCheck:
             self._take_earlier(code, carry_out=not held_back)
         return in_doubt
 
-    def _stands_before(self, wanted: Wanted) -> bool:
-        """Whether place and filament are the original's: an earlier line would do the same here."""
-        after = self._after.state
-        found = at.compare(wanted.before, after, at.WITHIN, self._place_mm, self._filament_mm)
-        return found == at.SAME and wanted.counts_filament(after)
+    def _stands_before(self, wanted: Wanted, *, held_back: bool) -> bool:
+        """Whether place and filament are the original's: an earlier line would do the same here.
+
+        When a line that is held back comes, a shaper may have begun the next move.
+        """
+        before, after = wanted.before, self._after.state
+        if held_back:
+            same = abs(before[at.FED] - after[at.FED]) <= self._filament_mm
+        else:
+            found = at.compare(before, after, at.WITHIN, self._place_mm, self._filament_mm)
+            same = found == at.SAME
+        return bool(same) and wanted.counts_filament(after)
 
     def _take_earlier(self, code: bytes, *, carry_out: bool) -> None:
         """Match a line to the first possible one with its text, not to the awaited one.
