@@ -214,10 +214,11 @@ class StreamWriter:
         first[:-1] = np.searchsorted(between_s, encoded.row_start_s - 1e-6)
         rest = encoded.row >= 0
         rows, places = encoded.row[rest], np.flatnonzero(rest)
-        first[rows] = places
+        # What the file says at rest comes before a shaper begins to move, ahead of the plan.
+        first[rows + 1] = places + 1
         # An event never moves across a rest, in either direction, not even across one that takes no
         # time or follows a stretch without written moves.
-        first[rows + 1] = np.maximum(first[rows + 1], places + 1)
+        first[rows] = places
         first = np.maximum.accumulate(first)
         until = np.full(len(first), len(encoded.row))
         until[rows] = places

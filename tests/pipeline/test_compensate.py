@@ -410,3 +410,18 @@ def test_what_the_last_check_refuses_stays_as_sliced(
         assert "internal error (the last check refuses the compensated lines: 'M117" in one.reason
     for one in result.put_back[3:]:
         assert "more than 3 pieces" in one.reason
+
+
+@pytest.mark.parametrize("machine", ["generic-bedslinger", "ender3"])
+def test_what_the_file_says_at_rest_comes_before_the_next_move(
+    machine: str, tmp_path: Path, cache: Path
+) -> None:
+    """A shaper, which a typed-in resonance leads to, begins to move before the plan does."""
+    side = "G1 X120 Y100 E1 F6000\nG1 X120 Y120 E1\nG1 X100 Y120 E1\nG1 X100 Y100 E1\n"
+    text = f"{HEAD}G1 X100 Y100 F6000\n{side}G1 Z5.4 F600\nM106 S90\n{side}"
+    result, written = compensated(text, tmp_path, cache, machine)
+    assert not result.put_back
+    lines = written.decode().splitlines()
+    lifted = lines.index("G1 Z5.4 F600")
+    between = lines[lifted + 1 : lines.index("M106 S90")]
+    assert not [line for line in between if line.startswith(("G1 X", "G1 Y"))]
