@@ -17,7 +17,7 @@ import numpy as np
 
 from stillpath.models.arrays import Array
 from stillpath.models.identification.excitation import regenerate
-from stillpath.models.identification.prompt import delayed
+from stillpath.models.identification.prompt import delay_of, delayed
 from stillpath.models.identification.types import (
     AccelerationLog,
     Axis,
@@ -112,11 +112,11 @@ def timed(
     later: Axis = "y" if apart_s > 0.0 else "x"
     other = "X" if later == "y" else "Y"
     one = found[later]
-    note = (
-        f"by the clocks of the logs the axis follows {1e3 * later_s:.2f} ms later than {other}: "
-        "commands allow for it"
-    )
     plants = _later(one.plants, later_s, 2.0 * sd_s * math.sqrt(share))
+    note = (
+        f"by the clocks of the logs the axis follows {1e3 * delay_of(plants.nominal):.2f} ms later "
+        f"than {other}: commands allow for it"
+    )
     return {**found, later: replace(one, plants=plants, notes=(*one.notes, note))}
 
 
@@ -136,13 +136,15 @@ def _later(plants: PlantSetSpec, delay_s: float, unsure_s: float) -> PlantSetSpe
         members = tuple(
             one.model_copy(update={"plant": delayed(one.plant, delay_s)}) for one in members
         )
+    nominal = delayed(plants.nominal, delay_s)
     about = plants.provenance
     if about is not None:
-        span_s = (max(0.0, delay_s - unsure_s), delay_s + unsure_s)
+        taken_s = delay_of(nominal)  # less, where an axis has too little damping for all of it
+        span_s = (max(0.0, taken_s - unsure_s), taken_s + unsure_s)
         about = about.model_copy(update={"slow_delay_s": span_s})
     return plants.model_copy(
         update={
-            "nominal": delayed(plants.nominal, delay_s),
+            "nominal": nominal,
             "members": members,
             "provenance": about,
         }

@@ -94,21 +94,27 @@ def test_comments_of_a_single_object_end_nothing(machine: Machine) -> None:
     assert len(pieces) == 2  # the head's, and the object's
 
 
-@pytest.mark.parametrize("firmware", ["klipper", "marlin", "reprapfirmware"])
+EXCLUDED = (
+    "EXCLUDE_OBJECT_START NAME=a",
+    "EXCLUDE_OBJECT_END NAME=a\nEXCLUDE_OBJECT_START NAME=b",
+)
+MARKS_OF_ALL = [
+    ("; printing object a id:0 copy 0", "; printing object b id:0 copy 0"),
+    (";MESH:a", ";MESH:b"),
+    (";PRINTING: a", ";PRINTING: b"),
+    ("M486 S0\n; printing object a", "M486 S-1\n; stop printing object a\nM486 S1"),
+]
+
+
 @pytest.mark.parametrize(
-    ("a", "b"),
+    ("firmware", "a", "b"),
     [
-        ("EXCLUDE_OBJECT_START NAME=a", "EXCLUDE_OBJECT_END NAME=a\nEXCLUDE_OBJECT_START NAME=b"),
-        ("; printing object a id:0 copy 0", "; printing object b id:0 copy 0"),
-        (";MESH:a", ";MESH:b"),
-        (";PRINTING: a", ";PRINTING: b"),
-        ("M486 S0\n; printing object a", "M486 S-1\n; stop printing object a\nM486 S1"),
+        ("klipper", *EXCLUDED),
+        *((kind, *m) for kind in ("klipper", "marlin", "reprapfirmware") for m in MARKS_OF_ALL),
     ],
 )
 def test_object_marks(firmware: str, a: str, b: str) -> None:
     """A mark ends a piece, and the travel after it is not ours; the same object's does not."""
-    if a.startswith("EXCLUDE") and firmware != "klipper":
-        pytest.skip("no command of theirs")
     again = f"{a}\n" if a.startswith(";") else ""
     jump = "G1 E-1\nG1 X20 Y20 F9000\nG1 E1\n"
     drawn = f"G1 X40 Y20 E1\n{again}G1 X40 Y40 E1\n"

@@ -62,6 +62,17 @@ def test_start_and_direction_are_found(
     assert aligned.notes == ()
 
 
+def test_a_log_that_begins_with_the_test_has_the_rest_before_it() -> None:
+    """As Klipper writes it: the machine stood still, and nobody recorded that."""
+    rested, cut = (align(log_of(lead_s=lead_s), SHORT) for lead_s in (0.8, 0.0))
+    assert abs(len(cut.command_mm_s2) - len(rested.command_mm_s2)) <= 2
+    still = int(0.45 * cut.rate_hz)
+    assert not cut.measured_mm_s2[:still].any()
+    assert not cut.command_mm_s2[:still].any()
+    begun = int(0.55 * cut.rate_hz)
+    assert np.abs(cut.command_mm_s2[still:begun]).max() > 100.0
+
+
 @settings(max_examples=12)
 @given(st.floats(0.0, 1e5), st.floats(-0.4, 8.0), st.floats(0.0, 6.0), st.integers(0, 2**32 - 1))
 def test_any_start_is_found(start_s: float, lead_s: float, tail_s: float, seed: int) -> None:

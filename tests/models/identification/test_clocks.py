@@ -130,6 +130,14 @@ def test_what_the_logs_of_both_axes_agree_on(
     assert [axis for axis, one in found.items() if one.notes] == list(expected_ms)
 
 
+def test_an_axis_of_little_damping_is_as_late_as_that_allows() -> None:
+    stiff = RelativeModesSpec(modes=(RelativeMode(f_hz=60.0, zeta=0.02, share=1.0),))
+    late: dict[Axis, list[Lateness]] = {"x": [ON_TIME], "y": [in_bands(0.6, 0.6, 0.6, 0.6)]}
+    found = timed(of_both(x=FREE, y=stiff), late)["y"]
+    assert delay_of(found.plants.nominal) == pytest.approx(0.02 / (np.pi * 60.0))
+    assert "0.11 ms later than X" in found.notes[0]
+
+
 @pytest.mark.parametrize(
     "plant",
     [
