@@ -49,7 +49,7 @@ class Compensator(Protocol):
     def ease(self, accel_share: float) -> bool:
         """Use at most this share of the machine's acceleration; return whether that is possible.
 
-        0: no more than the path itself needs.
+        0: no more than the path itself needs, if the compensator has such a command.
         """
         ...
 

@@ -1,10 +1,10 @@
 """Basis functions, of which commands are linear combinations.
 
 A basis is a matrix Psi of shape (m, n) with orthonormal columns, so that the coefficients' norm is
-the effort; n counts functions (the n + 1 of paper 003). In full preview they compose the command
-itself; in limited preview its second difference, where the plant is G with two integrators in
-front (docs/method.md). CE-Opt, robust and DCT functions are nested: those for n are the first n of
-those for more.
+the effort; n counts functions (the n + 1 of paper 003, Ramani's dissertation). In full preview they
+compose the command itself; in limited preview its second difference, where the plant is G with two
+integrators in front (docs/method.md). CE-Opt, robust and DCT functions are nested: those for n are
+the first n of those for more.
 """
 
 from __future__ import annotations

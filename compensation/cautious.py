@@ -46,8 +46,8 @@ class Caution:
 class CautiousFbf:
     """share * filtered basis functions + (1 - share) * shaper, axis by axis.
 
-    A shaper needs no more than the path: where the motors cannot follow any command of filtered
-    basis functions, or only one that is less accurate, the shaper's is used.
+    A shaper demands no more acceleration than the path: where the motors cannot follow any command
+    of filtered basis functions, or only one that is less accurate, the shaper's is used.
 
     Raises
     ------

@@ -10,4 +10,4 @@ from typing import Final
 __all__ = ["DEFAULT_BASIS", "DEFAULT_METHOD"]
 
 DEFAULT_METHOD: Final = "fbf"
-DEFAULT_BASIS: Final = "ce-opt"
+DEFAULT_BASIS: Final = "ce-opt"  # control-effort-optimal (compensation/basis.py)

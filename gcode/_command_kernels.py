@@ -66,6 +66,10 @@ def execute(action: int, w: Any, mask: int, f: Any, i: Any, rows: Any, tables: A
         An `Action`, or the `EventKind` of a line that only leaves its event.
     w, mask : ndarray of 26 floats, int
         Values of the words A to Z and which of them are present.
+    f, i : ndarray
+        The state (`gcode._slots`).
+    rows, tables
+        Where moves and events are written; the tables of the dialect (`gcode._table_kernels`).
     """
     if action < _MOVE:  # an `EventKind`
         if action == _UNKNOWN:

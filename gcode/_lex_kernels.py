@@ -56,6 +56,7 @@ from stillpath.gcode._slots import (
     MEMO_OBJECT,
     MEMO_STRIDE,
     OK,
+    Action,
 )
 from stillpath.gcode._table_kernels import (
     line_hash,
@@ -73,7 +74,7 @@ __all__ = ["PADDING", "run"]
 PADDING = 32
 _HARMLESS, _LIMITS, _UNKNOWN, _OBJECT = 0, 2, 4, 5
 _POWERS = 10.0 ** np.arange(23)
-_MOVES = 22  # actions 20 to 22 are G0 to G3
+_MOVE, _LAST_MOVE = int(Action.MOVE), int(Action.ARC_CCW)  # G0 and G1, then G2, then G3
 
 
 @kernel(force_inline=True, allocates=False)
@@ -185,7 +186,7 @@ def run(buf: Any, stop: int, f: Any, i: Any, w: Any, rows: Any, tables: Any) -> 
             elif known and letter == 77:
                 action = int(tables.m_words[number])
             elif i[I_MODAL_WORDS] and 88 <= letter <= 90 and i[I_MOTION] >= 0:
-                action = 20 + max(0, i[I_MOTION] - 1)
+                action = _MOVE + max(0, i[I_MOTION] - 1)
                 p = first
             good = good and action >= 0
             # Words: single letters with plain decimal numbers; anything else is for Python.
@@ -250,18 +251,18 @@ def run(buf: Any, stop: int, f: Any, i: Any, w: Any, rows: Any, tables: Any) -> 
             if not good or tail - begin > i[I_LONGEST]:
                 p = line_end(buf, first)
                 i[I_END] = min(p + 1, stop)
-                if action >= 20:
+                if action >= _MOVE:
                     return HANDBACK
                 status = recall(buf, first, p, f, i, rows, tables)
                 if status != OK:
                     return status
             else:
                 i[I_END] = min(p + 1, stop)
-                if 20 <= action <= _MOVES:
-                    if action == 20 and mask & i[I_ODD_WORDS]:
+                if _MOVE <= action <= _LAST_MOVE:
+                    if action == _MOVE and mask & i[I_ODD_WORDS]:
                         return HANDBACK
-                    i[I_MOTION] = action - 19 if action > 20 else 1
-                if action == 20:
+                    i[I_MOTION] = action - _MOVE + 1 if action > _MOVE else 1
+                if action == _MOVE:
                     status = move(w, mask, f, i, rows)
                 else:
                     status = execute(action, w, mask, f, i, rows, tables)

@@ -179,7 +179,7 @@ def move(
         absolute = extruder_is_absolute(i)
         unscaled = f[F_EXTRUDE_FACTOR] == 1.0 and f[F_SPEED_FACTOR] * 60.0 == 1.0
         if i[I_AXES_FACTORS] and axes == 0 and not unscaled:
-            # Only the extruder moves: M220 and M221 do not hold.
+            # Only the extruder moves: M220 and M221 do not apply.
             at = (f[F_LAST + 3] - f[F_BASE + 3]) / f[F_EXTRUDE_FACTOR]
             f[F_LAST + 3] += length - at if absolute else length
             if f[F_EXTRUDE_FACTOR] != 1.0:

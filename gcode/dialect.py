@@ -111,7 +111,7 @@ class Dialect:
     ignores_subcodes: bool = False
     """G28.1 is G28, unless G28.1 has a meaning of its own (Marlin)."""
     one_command: bool = True
-    """A second G or M in a line is no command of its own."""
+    """A second G or M in a line is not a separate command."""
     fold_case: bool = True
     """Lower case is read as upper case."""
     first_wins: bool = False
@@ -133,15 +133,15 @@ class Dialect:
     factor_default: bool = True
     """M220 and M221 without S mean 100 %."""
     factors_need_axes: bool = False
-    """M220 and M221 do not hold for moves of the extruder alone."""
+    """M220 and M221 do not apply to moves of the extruder alone."""
     retraction_scaled: bool = True
-    """M220 and M221 hold for G10 and G11."""
+    """M220 and M221 apply to G10 and G11."""
     zero_feed_passes: bool = False
-    """An F of 0 or less is passed over, not refused."""
+    """An F of 0 or less is ignored, not refused."""
     bad_words_pass: bool = False
-    """A word without a number is passed over, not refused."""
+    """A word without a number is ignored, not refused."""
     bad_arcs_pass: bool = False
-    """An arc without centre is passed over, not refused."""
+    """An arc without centre is ignored, not refused."""
     tool_at_start: bool = True
     """Tool 0 is in use before the first T."""
     odd_words: str = ""

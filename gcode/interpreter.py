@@ -43,7 +43,7 @@ _LONGEST_LINE = 1 << 24
 _LONGEST_COMMAND = 65_536
 _FEWEST_ROWS, _MOST_ROWS = 1024, 32_768
 _SHORT_LINE = 24  # bytes; rows are allocated for lines of about this length
-_SPARE_ROWS = 8  # as many as one command of Python's may write
+_SPARE_ROWS = 8  # as many as a handler in Python may write for one command
 
 
 class Interpreter:

@@ -1,9 +1,10 @@
 """Mix fbf with a shaper as far as the plants are known: what `robust=auto` decides.
 
-For every plant that explains the measurement, a file should print no worse than with the shaper
-tuned from the same measurement. Both commands are therefore simulated on the reference motion with
-all members of the set, and the mixture is chosen that is best for the likely members without being
-bad for any. The error ratio of the worst member is stored with the choice.
+The aim: no plant that explains the measurement prints worse than with the shaper that is tuned from
+the same measurement. Both commands are simulated on the reference motion with all members of the
+set, and the mixture that is best for the likely members is chosen. Being worse than the shaper on
+any member has a price (`_PRICE`); it is not forbidden, since plants contradict each other. The
+error ratio of the worst member is stored with the choice.
 """
 
 from __future__ import annotations
@@ -178,7 +179,7 @@ def caution_for(
 
 
 def stated_note(machine: Machine, shaper: BestShaper) -> str | None:
-    """Return a note on what a typed-in resonance is good for; None if both axes were measured."""
+    """Return a warning on what a typed-in resonance is good for; None if both are measured."""
     typed = [axis.upper() for axis in ("x", "y") if stated_hz(machine.axes[axis]) is not None]
     if not typed:
         return None

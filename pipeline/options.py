@@ -86,10 +86,10 @@ class Options(BaseModel):
     basis: BasisName = Field(default=DEFAULT_BASIS, description="Basis functions of `fbf`.")
     robust: RobustMode = Field(
         default="auto",
-        description="What `fbf` is designed for: all plants that explain the measurement, with as "
-        "much of a shaper's smoothing as no plant fares worse for (`auto`), the nominal plant "
-        "(`off`), or the machine's plant set by least squares (`ensemble`) or for its worst member "
-        "(`minimax`).",
+        description="What `fbf` is designed for: all plants that explain the measurement, "
+        "mixed with a shaper as far as these plants contradict each other (`auto`), the nominal "
+        "plant (`off`), or the machine's plant set by least squares (`ensemble`) or for its worst "
+        "member (`minimax`).",
     )
     along: float | None = Field(
         default=None,

@@ -288,7 +288,7 @@ class PrintWay(_Figures):
 
 
 class Result(_Figures):
-    """Report of one job; `reports` turns it into HTML, the API returns it as JSON."""
+    """Report of one job; `reports` writes it as HTML and JSON."""
 
     version: str
     """Version of Stillpath."""

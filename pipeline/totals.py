@@ -135,7 +135,7 @@ class Totals:
         return max(1.0 - left_s / chosen_s, 0.0) if chosen_s > 0.0 else 0.0
 
     def left_out(self, where: str) -> Iterator[str]:
-        """Yield warnings about what the options of the job left as sliced."""
+        """Yield a note on what the options of the job left as sliced."""
         if where != "all":
             yield (
                 f"where={where}: {self.left_out_s:.0f} s of motion are left as sliced, "

@@ -1,4 +1,7 @@
-"""Check that a compensated piece is executed as commanded, and no worse than as sliced."""
+"""Check that a compensated piece is executed as commanded.
+
+Where the firmware rounds to motor steps, also that it is not clearly worse than as sliced.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +30,7 @@ _END_MM = np.array([1e-6, 1e-6, 1e-6, 1e-4])
 _STRIDE = 6
 _PAST = 2000
 """Samples of motion kept from before a piece, as vibration may last into it."""
-_CLEARLY = 1.1
+_CLEARLY_WORSE = 1.1
 
 
 class Verifier:
@@ -118,7 +121,7 @@ class Verifier:
         meter.push(path_mm, np.stack(responses), extruding)
         meter.flush()
         sliced_um, ours_um = (1e3 * tally.rms for tally in meter.contour_extruding)
-        if ours_um > max(_CLEARLY * sliced_um, NEGLIGIBLE_UM):
+        if ours_um > max(_CLEARLY_WORSE * sliced_um, NEGLIGIBLE_UM):
             raise Unfit(
                 f"rounded to motor steps, its contour error would be {ours_um:.1f} µm rms, against "
                 f"{sliced_um:.1f} µm as sliced"

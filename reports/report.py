@@ -103,7 +103,7 @@ def headline_figures(channels: Sequence[Channel]) -> dict[str, Any]:
         "before": before,
         "after": after,
         "shaper": rms.get("shaper"),
-        # Measuring a file that came as it was is no improvement, whatever the last digit says.
+        # Measuring an unchanged file is no improvement, whatever the last digit says.
         "ratio": ratio if ratio and ratio >= 1.05 else None,
     }
 

@@ -94,13 +94,13 @@ class Settings(MachineSettings, BaseSettings):
         Number of times a job may lose its worker before it fails; stops of the service do not
         count.
     heartbeat_timeout_s : float
-        A worker that has been silent for so long is lost.
+        A worker that has been silent for this long is lost.
     cancel_grace_s : float
         How long a worker may take to obey a cancel before its process is ended.
     max_job_s, max_job_bytes : float, int
         A job that takes longer, or whose process grows larger, fails.
     computing_processes : int
-        Further processes, for jobs of minutes: designs, identifications,
+        Further processes, for short jobs (minutes, not hours): designs, identifications,
         controllers. With a scheduler: how many of its places are kept for these.
     max_computing_s, max_computing_bytes : float, int
         Such a job that takes longer, or whose process grows larger, fails.
@@ -108,13 +108,13 @@ class Settings(MachineSettings, BaseSettings):
         A larger upload is refused with status 413.
     disk_reserve_bytes : int
         Stays free on the disk of `data_dir`: uploads that would leave less are refused with status
-        507, jobs wait for half of it. 0: the disk is not looked at.
+        507, jobs wait for half of it. 0: no check.
     max_jobs_per_owner, max_bytes_per_owner : int
         Unfinished jobs, and bytes of all jobs kept, that one owner may have.
     requests_per_minute : int
         Of one key, or of one address without a key; reading progress does not count.
     keep_days : float
-        Finished jobs are deleted after so long.
+        Finished jobs are deleted after this many days.
     keys : bool, optional
         Whether callers must show a key. By default they must unless the service is bound to
         loopback.

@@ -32,7 +32,7 @@ class QueuePlanner(ABC):
         self._queue = np.empty((_ROWS, columns))
         self._count = 0
         """Rows of the queue in use."""
-        self._moves = 0
+        self._next_move = 0
         """Index of the next move in the whole file."""
         self._begun = False
         self._time_s = 0.0
@@ -46,14 +46,14 @@ class QueuePlanner(ABC):
         return self._time_s
 
     def push(self, block: ProgramBlock) -> Phases:
-        """Plan the moves of a block, with the stops that its events bring.
+        """Plan the moves of a block, with the stops that its events cause.
 
         Raises
         ------
         GcodeError
             For a move that the firmware refuses.
         """
-        self._moves = block.first_move
+        self._next_move = block.first_move
         parts = []
         for begun, end, dwell_s in between_stops(block):
             parts.append(self._plan(block.moves, begun, end, block.limits))
@@ -106,7 +106,7 @@ class QueuePlanner(ABC):
         problem, bad = self._append(moves, slice(begun, end))
         if problem >= 0:
             raise self._error(problem, moves, begun + bad)
-        self._moves += n
+        self._next_move += n
         self._begun = self._begun or self._count > 0
 
     def _due(self) -> bool:

@@ -108,7 +108,7 @@ class Marlin(FirmwareFacts):
     block_buffer_size: Literal[4, 8, 16, 32, 64, 128] = 16
     """BLOCK_BUFFER_SIZE."""
     minimum_planner_speed_mm_s: Positive = 0.05
-    """MINIMUM_PLANNER_SPEED of 2.0 and 2.1."""
+    """MINIMUM_PLANNER_SPEED: lowest speed at a junction. `bugfix` computes its own."""
     linear_advance: bool | None = None
     """LIN_ADVANCE, classic: K above 0 caps accelerations. None: not known; times are planned as
     without it, but a file that sets K is taken for one of a printer that has it: the stream's

@@ -39,7 +39,7 @@ class Population(Generic[P]):
     weights : tuple of float
         Share of the crowd that each stands for; they add up to 1.
     middle : int
-        Number of the first member among the candidates for it.
+        Index of the first member in `centres`.
     crowd : tuple of PlantSpec
     """
 
@@ -80,7 +80,7 @@ def mode_spread(population: Population[RelativeModesSpec]) -> tuple[ModeEstimate
 
 
 def representatives(centres: Sequence[P], crowd: Sequence[P]) -> Population[P]:
-    """Choose members: one in the middle, then, again and again, the one least like those chosen.
+    """Choose members: one in the middle, then repeatedly the one farthest from those chosen.
 
     The distance of plants is the rms difference of their responses to a path with corners.
 

@@ -1,7 +1,7 @@
 """Plant sets for robust design: the plants that an axis may have.
 
-Several measurements give their own members; a single one is varied by what experience says of
-such a measurement.
+Several measurements give their own members; a single one is varied by the typical spread of such
+measurements.
 """
 
 from __future__ import annotations
@@ -160,7 +160,7 @@ def spectrum_set(
     Parameters
     ----------
     frame_likely : float
-        That a weak mode far below the strongest is the frame's (`frame.likely_of`).
+        Probability that a weak mode far below the strongest is the frame's (`frame.likely_of`).
     """
     found = explanations.explained(frame_likely)
     fit, population = found.fit, found.population
@@ -243,7 +243,7 @@ def provenance_of(
     Parameters
     ----------
     measured : sequence of FrequencyResponse
-        Whose coherence is told, if it is known.
+        Responses whose coherence is recorded, if it is known.
     delays_s : (float, float), optional
         What the plants that explain the measurement delay slow motion by.
     """

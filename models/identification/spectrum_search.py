@@ -56,7 +56,7 @@ _SAME = 0.03
 class Candidate:
     """Parameters [log gain, log noise, modes ...] of a structure, and their residual.
 
-    `cost` is twice the negative log of likelihood times prior, and what parameters cost;
+    `cost` is twice the negative log of likelihood times prior, plus a penalty per parameter;
     `covariance` that of the vector where both are taken to be normal around the fit (Laplace).
     """
 
@@ -168,13 +168,13 @@ class Search:
         out = []
         for _ in range(_DRAWS):
             start = accepted[int(self.rng.choice(len(accepted), p=likely / likely.sum()))]
-            # Which of the repeats happen to be there (Bayesian bootstrap, Rubin 1981).
+            # Random weights of the repeats (Bayesian bootstrap, Rubin 1981).
             weights = self.rng.dirichlet(np.ones(len(self.repeats)))
             log_psd = weights @ self.repeats + root @ self.rng.standard_normal(len(root))
-            out.append(self._rung(self.polished(start, whitening, log_psd, 12)))
+            out.append(self._with_drawn_damping(self.polished(start, whitening, log_psd, 12)))
         return out
 
-    def _rung(self, fit: Candidate) -> Candidate:
+    def _with_drawn_damping(self, fit: Candidate) -> Candidate:
         """Draw the damping of modes beyond the band, of which only the flank was measured."""
         n, vector = fit.structure.modes, fit.vector.copy()
         beyond = np.exp(fit.theta[:n]) * self._unit_hz > _SEEN * self.model.f_hz[-1]

@@ -55,7 +55,7 @@ _ASKED_AT_ONCE = 8
 
 @dataclass(frozen=True, slots=True)
 class Taken:
-    """A job, whether it is new or one that was there already, and how many wait before it."""
+    """A job, whether it is new, and how many jobs are ahead of it."""
 
     job: Job
     is_new: bool
@@ -71,9 +71,9 @@ class Intake:
     Parameters
     ----------
     printers : mapping
-        That results may be sent to, by name.
+        Printers that results may be sent to, by name.
     checker : Checker
-        Compares a job's printer with its machine; what differs stands in the report.
+        Compares a job's printer with its machine; differences go into the report.
     disk : Disk
         Disk that holds the uploads.
 
@@ -131,7 +131,7 @@ class Intake:
         Parameters
         ----------
         wanted : JobQuery
-            A form may say `print` as well, as OctoPrint's does.
+            `print` may also come as a form field, as with OctoPrint.
 
         Raises
         ------
@@ -171,7 +171,7 @@ class Intake:
     def _admit(
         self, wanted: JobQuery, caller: Caller, incoming: Path, idempotency_key: str | None
     ) -> PinnedMachine:
-        """Refuse what can be refused before the body, and write the machine beside its place.
+        """Refuse what can be refused before the body is read; store the machine with the upload.
 
         Doing this first shortens the wait after the body was sent.
         """
@@ -240,12 +240,12 @@ class Intake:
         return self._taken(added, added.id == job_id, upload)
 
     def ask(self, job: Job, files: Mapping[str, Path]) -> Job:
-        """Put a job that is no compensation in the queue, unless the owner has the same one.
+        """Put a job other than a compensation in the queue, unless the owner has the same one.
 
         Parameters
         ----------
         files : mapping
-            Of its storage's keys to local files, which are moved there.
+            Storage keys to local files, which are moved there.
 
         Returns
         -------
@@ -296,7 +296,7 @@ class Intake:
         return Taken(job, is_new, upload, self._store.queue_position(job))
 
     def _undo(self, job: Job) -> None:
-        """Delete what was stored for a job that was refused, or that another one stands for.
+        """Delete what was stored for a job that was refused, or replaced by an existing one.
 
         The sweep deletes what cannot be deleted now. If the database failed it may have stored the
         job nevertheless: then its files stay.
@@ -306,7 +306,7 @@ class Intake:
                 self._storage.delete(job.files)
 
     def _check_targets(self, wanted: JobQuery) -> None:
-        """Refuse where nothing may be sent to."""
+        """Refuse targets that are not allowed."""
         try:
             if wanted.webhook is not None:
                 check_webhook(wanted.webhook, self._settings)
@@ -374,7 +374,7 @@ class Intake:
 
 
 def _with_fields(wanted: JobQuery, upload: Upload) -> JobQuery:
-    """Take `print` of a form, which is how printers' own APIs are told so.
+    """Take `print` from the form, as printers' own APIs do.
 
     Other parameters in the form are refused: they would be ignored without a word.
     """

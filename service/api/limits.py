@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 __all__ = ["COUNTED", "CallerLimits", "limited_receive", "name_of", "unreadable"]
 
 COUNTED = "stillpath.body_counted"
-"""Key of the ASGI scope that a route sets which counts the bytes of its body itself."""
+"""Key in the ASGI scope, set by routes that count the bytes of their body themselves."""
 
 _MOST_UPLOADS = 32
 _MOST_BUCKETS = 10_000
@@ -43,7 +43,7 @@ class CallerLimits:
     Parameters
     ----------
     uploads : int
-        That one caller may have on their way at once.
+        Uploads that one caller may have in progress.
     clock : callable
         Monotonic seconds.
     """
@@ -60,7 +60,7 @@ class CallerLimits:
         self._uploads = uploads
         self._clock = clock
         self._lock = threading.Lock()
-        # What is left, and when that was; a bucket that nobody remembers is full.
+        # What is left, and when that was; a missing bucket counts as full.
         self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()
         # Only touched within the event loop.
         self._uploading: dict[str, list[BodyTimeout | None]] = {}
@@ -119,8 +119,8 @@ class CallerLimits:
                 raise Problem(
                     429,
                     "Too many uploads at once",
-                    f"{len(slots)} uploads of yours are on their way, the limit. Wait for one to "
-                    "end.",
+                    f"You have {len(slots)} uploads in progress, which is the limit. Wait for "
+                    "one to end.",
                     headers={"Retry-After": "5", "Connection": "close"},
                 )
             slots.remove(silent)

@@ -33,7 +33,7 @@ __all__ = [
 _WRITE_BYTES = 1 << 20
 _DEFAULT_NAME = "upload.gcode"
 _LONGEST_NAME_BYTES = 180
-"""Of a file's name; with what a result's name has more it stays below the usual 255."""
+"""Longest file name; what the result's name adds still fits the usual 255 bytes."""
 _SUFFIX = re.compile(r"(\.gcode)?\.[A-Za-z0-9]{1,10}$", re.IGNORECASE)
 
 
@@ -44,7 +44,7 @@ class Upload:
     Attributes
     ----------
     name : str
-        As its sender called the file, made safe.
+        The sender's name for the file, made safe.
     fields : mapping
         The form's other parts.
     """
@@ -76,15 +76,15 @@ async def receive_upload(request: Request, target: Path, *, max_bytes: int, disk
         Is left incomplete when an error is raised; the caller deletes it. Nothing is synced:
         what stores the file for good does that.
     disk : Disk
-        That `target` is on.
+        The disk that holds `target`.
 
     Raises
     ------
     Problem
-        408 if its sender falls silent, 413 if the body is too large, 422 if it is empty or broken.
+        408 if its sender stops sending, 413 if the body is too large, 422 if it is empty or broken.
     NoRoom
     """
-    # Beside the upload lies what is made of it, which is as large at least.
+    # The result is stored too, and is at least as large as the upload.
     disk.check_ever(2 * _check_declared(request, max_bytes, disk))
     fields: dict[str, str] = {}
     with target.open("wb") as file:
@@ -128,14 +128,14 @@ async def receive_files(
     folder : Path
         Is left as it is when an error is raised; the caller deletes it.
     max_bytes : int
-        Of all together.
+        Limit for all files together.
     disk : Disk
-        That `folder` is on.
+        The disk that holds `folder`.
 
     Raises
     ------
     Problem
-        408 if its sender falls silent, 413 if the body is too large, 422 if it is broken.
+        408 if its sender stops sending, 413 if the body is too large, 422 if it is broken.
     NoRoom
     """
     _check_declared(request, max_bytes, disk)
@@ -215,7 +215,7 @@ class _Sink:
 
     def _flush(self) -> None:
         collected = b"".join(self._chunks)
-        # Others write as well since the upload began.
+        # Others may have written since the upload began.
         self.disk.check(len(collected))
         self._chunks.clear()
         self._waiting_bytes = 0

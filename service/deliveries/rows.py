@@ -58,7 +58,7 @@ class Delivery:
 
 
 def deliveries_of(engine: Engine, job_ids: Iterable[str]) -> dict[str, list[Delivery]]:
-    """Return what goes out for jobs, by their ids."""
+    """Return the deliveries of jobs, by their ids."""
     wanted = list(dict.fromkeys(job_ids))
     found: defaultdict[str, list[Delivery]] = defaultdict(list)
     for start in range(0, len(wanted), _AT_ONCE):
@@ -82,7 +82,7 @@ def claim(engine: Engine, *, now: float, until: float) -> tuple[Delivery, bool] 
         As claimed; and whether an earlier attempt ended without an answer, so that it is unknown
         whether it arrived. None: nothing is due.
     """
-    # What was never tried need not wait, whatever the clock of the worker says that noted it.
+    # What was never tried need not wait, whatever the clock said on the worker that recorded it.
     new = and_(deliveries.c.state == "waiting", deliveries.c.attempts == 0)
     due = (
         select(deliveries)
@@ -104,14 +104,14 @@ def claim(engine: Engine, *, now: float, until: float) -> tuple[Delivery, bool] 
 
 
 def bring_forward(engine: Engine, *, waiting: Sequence[float], sending: float) -> None:
-    """Let nothing be due later than that, because the clock was set back.
+    """Let nothing be due later than these times, because the clock was set back.
 
     Parameters
     ----------
     waiting : sequence of float
-        After one attempt, two, ...; the last also after more.
+        Latest time after one attempt, two, ...; the last one also applies to more.
     sending : float
-        A sender that is alive prolongs its claim before.
+        A sender that is alive extends its claim before then.
     """
     row = deliveries.c
     latest = [(row.attempts <= k, at) for k, at in enumerate(waiting, 1)]
@@ -139,7 +139,7 @@ def _changed(engine: Engine, before: Delivery, after: Delivery) -> bool:
         update(deliveries)
         .where(
             deliveries.c.id == before.id,
-            deliveries.c.job_id == before.job_id,  # SQLite gives the id of a deleted row again
+            deliveries.c.job_id == before.job_id,  # SQLite reuses the ids of deleted rows
             deliveries.c.state == before.state,
             deliveries.c.attempts == before.attempts,
         )

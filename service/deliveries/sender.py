@@ -37,7 +37,7 @@ _STOP_S = 5.0
 _GROWTH, _MOST_STEPS = 3.0, 20
 _LONGEST_WAIT_S = 6 * 3600.0
 # Status codes after which a retry is useless.
-_IN_VAIN = frozenset((400, 401, 404, 405, 410, 413, 414, 415, 422))
+_PERMANENT_STATUSES = frozenset((400, 401, 404, 405, 410, 413, 414, 415, 422))
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,11 +47,11 @@ class SendingTimes:
     Attributes
     ----------
     first_wait_s : float
-        Before the second attempt; each further one waits three times as long.
+        Wait before the second attempt; each later wait is three times as long, up to 6 h.
     claim_s : float
         Time without a sign of life after which a sender counts as dead.
     poll_s : float
-        How often the table is looked at.
+        How often the table is polled.
     start_within_s : float
         A print that cannot start so soon after its job was done is not started later, when nobody
         may be there to watch; its file is uploaded all the same.
@@ -193,7 +193,7 @@ class Sender:
         return True
 
     def _deliver(self, claimed: Delivery, unknown_before: bool) -> None:
-        """Send one delivery and write down what became of it."""
+        """Send one delivery and record the outcome."""
         log = self._log.bind(
             job=claimed.job_id, delivery=claimed.id, kind=claimed.kind, attempt=claimed.attempts
         )
@@ -211,7 +211,7 @@ class Sender:
         self._settle(claimed, state, time.time() + wait_s, error)
 
     def _settle(self, claimed: Delivery, state: str, next_at: float, error: str | None) -> None:
-        """Write it down, for as long as the claim holds if the database is away."""
+        """Record the outcome; if the database is away, try for as long as the claim holds."""
         deadline = time.monotonic() + self._times.claim_s
         while True:
             try:
@@ -332,8 +332,10 @@ def _judged(reply: Reply) -> tuple[str, str | None]:
     error = f"answered with status {reply.status}" + (f": {said}" if said else "")
     if 300 <= reply.status < 400:
         return "failed", f"answered with status {reply.status}; redirects are not followed"
-    return ("failed" if reply.status in _IN_VAIN else "waiting"), error
+    return ("failed" if reply.status in _PERMANENT_STATUSES else "waiting"), error
 
 
 def _unknown(why: str) -> str:
-    return f"{why}; the print may have been started or not, so it is not tried again: look at it"
+    return (
+        f"{why}; the print may or may not have started, so this is not retried: check the printer"
+    )

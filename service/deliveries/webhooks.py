@@ -21,7 +21,7 @@ _TIMEOUT_S = 10.0
 
 
 class SignatureRefused(ValueError):
-    """The webhook was not signed with the secret, or too long ago."""
+    """The signature does not match the secret, or is too old."""
 
 
 def body_of(job: Job) -> bytes:
@@ -58,7 +58,7 @@ def sign(secret: str, at: int, body: bytes) -> str:
     """Return the value of the header `SIGNATURE`: ``t=SECONDS,v1=HEX``.
 
     The HMAC-SHA256 is of the seconds since the epoch, a dot, and the body, so that neither can be
-    exchanged.
+    altered.
     """
     digest = hmac.new(secret.encode(), b"%d." % at + body, hashlib.sha256).hexdigest()
     return f"t={at},v1={digest}"
@@ -67,7 +67,7 @@ def sign(secret: str, at: int, body: bytes) -> str:
 def verify(secret: str, header: str, body: bytes, *, now: float, tolerance_s: float = 300) -> None:
     """Check a webhook, as its receiver does.
 
-    A second copy of the same one within the tolerance is told by `Stillpath-Delivery`.
+    Use `Stillpath-Delivery` to recognise a repeat within the tolerance.
 
     Raises
     ------
@@ -79,7 +79,7 @@ def verify(secret: str, header: str, body: bytes, *, now: float, tolerance_s: fl
         raise SignatureRefused(f"the header {SIGNATURE} is not t=SECONDS,v1=HEX")
     expected = sign(secret, int(moment), body)
     if not hmac.compare_digest(expected.encode(), f"t={moment},v1={parts.get('v1', '')}".encode()):
-        raise SignatureRefused("the signature is not of this secret, time and body")
+        raise SignatureRefused("the signature does not match this secret, time and body")
     if abs(now - int(moment)) > tolerance_s:
         raise SignatureRefused(f"it was signed more than {tolerance_s:.0f} s ago: a replay")
 

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 __all__ = ["Reconciler"]
 
 _LEASE, _LEASE_S, _RENEW_S = "reconciler", 5.0, 2.0
-"""A lease is renewed when older than the last: every write waits for the disk, like uploads."""
+"""A lease is renewed only once it is older than `_RENEW_S`: each write waits for the disk."""
 _TICK_S = 0.5
 _SWEEP_EVERY_S = 60.0
 _MOST_REMEMBERED = 10_000

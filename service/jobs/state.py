@@ -5,7 +5,7 @@
                 claimed                finished
     QUEUED ------------------> RUNNING ---------> DONE
      | ^                       | |  |
-     | |  lost, attempts left; | |  |  failed, or lost once too often
+     | |  lost, may be retried;| |  |  failed, or lost once too often
      | |  no room on the disk  | |  |
      | +-----------------------+ |  +-------------------------------> FAILED
      |                           |
@@ -41,7 +41,7 @@ __all__ = [
 ]
 
 START_WITHIN_S = 3600.0
-"""How long after its job was done, or while no service worked on it, a print may still start:
+"""How long after its job ended, or after the service was last running, a print may still start:
 later nobody may be there to watch."""
 WAITING_FOR_ROOM = "waiting for room on the disk"
 """Stage of a requeued job whose files had no room."""
@@ -60,7 +60,7 @@ class JobKind(StrEnum):
 
     @property
     def is_short(self) -> bool:
-        """Whether it takes minutes at most, so that it does not queue behind long jobs."""
+        """Whether it is short (minutes, not hours), so that it does not queue behind long jobs."""
         return self not in (JobKind.COMPENSATION, JobKind.TRAJECTORIES)
 
 
@@ -247,11 +247,11 @@ class Failed:
 
 @dataclass(frozen=True, slots=True)
 class Lost:
-    """The worker died, or the service stopped, in the middle of the job.
+    """The worker died, the service stopped, or the storage failed in the middle of the job.
 
-    `max_attempts` is the number of losses with which the job fails; `blame` says whether it may be
-    the cause (not if the service was stopped). `problem` is what the job finally fails with, if
-    more is known than that its worker is gone.
+    `max_attempts` is the number of losses with which the job fails; `blame` says whether the job
+    may have killed its worker: only then does the loss count. `problem` is what the job finally
+    fails with, if more is known than that its worker is gone.
     """
 
     attempt: int

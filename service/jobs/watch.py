@@ -199,7 +199,7 @@ class Watch:
     def _look(self) -> None:
         now, attempt = time.time(), self._job.attempt
         if (reason := self._interrupted()) is not None:
-            self._decide(Lost(attempt, now, reason, 0, blame=False))
+            self._decide(Lost(attempt, now, reason, max_attempts=0, blame=False))
         elif (found := self._limit_reached()) is not None:
             self._decide(Failed(attempt, now, found))
         elif not self._has_room():

@@ -29,7 +29,7 @@ Q_RATE = 12  # nominal, steps/s
 Q_ACCEL = 13  # mm/s2
 Q_ACCEL_STEPS = 14  # steps/s2
 Q_JUNCTION2 = 15  # highest entry speed, squared
-Q_FLOOR2 = 16  # speed from which the firmware dares to stop at once, squared
+Q_FLOOR2 = 16  # lowest speed at either end (MINIMUM_PLANNER_SPEED, or bugfix's own), squared
 Q_REACH2 = 17  # entry speed from which the rest of the queue can be braked, squared
 Q_INDEX = 18
 Q_SIZE = 19
@@ -209,6 +209,7 @@ def _block(
     accel = max(floor(accel), 1.0)
     accel_mm = accel / per_mm
 
+    # No junction is slower than this; bugfix: as fast as the first step allows.
     floor2 = facts[C_MIN_SPEED] ** 2
     if family == BUGFIX:
         floor2 = min(0.5 * accel_mm / per_mm, nominal * nominal)
@@ -257,7 +258,7 @@ def _block(
     row[Q_ACCEL_STEPS] = accel
     row[Q_FLOOR2] = floor2
     row[Q_JUNCTION2] = max(junction2, floor2)
-    if blocks == 0.0:
+    if blocks == 0.0:  # from an empty queue: the lowest speed
         row[Q_JUNCTION2] = floor2
     state[S_STEPS] = s0
     state[S_STEPS + 1] = s1
@@ -296,7 +297,7 @@ def _swallow(start: Any, end: Any, row: Any) -> None:
 
 @kernel(inline=True)
 def _axis_accel(accel: float, largest: float, steps: float, own: float) -> float:
-    """Cap the acceleration of the leading axis such that an axis keeps its own."""
+    """Cap the acceleration of the leading axis so that another axis keeps its own limit."""
     largest = floor(largest)
     if own > 0.0 and largest < accel:
         return min(accel, floor(largest * steps / own))
@@ -309,15 +310,15 @@ def _advance_cap(end: Any, limit: Any, facts: Any, state: Any) -> float:
     x = end[0] - state[S_POSITION]
     y = end[1] - state[S_POSITION + 1]
     z = end[2] - state[S_POSITION + 2]
-    way = sqrt(x * x + y * y + z * z)
+    path = sqrt(x * x + y * y + z * z)
     feed = end[3] - state[S_POSITION + 3]
-    if feed > 3.0 * way or feed <= 0.0:
+    if feed > 3.0 * path or feed <= 0.0:
         return 1e30  # a retraction that was joined with a move; or none
     jerk = limit[L_JERK + 3]
     if facts[C_CLASSIC_JERK] == 0.0:
         half = sqrt(0.5)
         jerk = sqrt(limit[L_DEVIATION] * half / (1.0 - half) * limit[L_ACCEL + 3])
-    return float(jerk / (limit[L_ADVANCE] * feed / way))
+    return float(jerk / (limit[L_ADVANCE] * feed / path))
 
 
 @kernel

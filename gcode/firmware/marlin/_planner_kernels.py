@@ -88,7 +88,7 @@ def settle(queue: Any, count: int, facts: Any, final: bool) -> int:
             far, end2 = queue[blocks[last + 1]], queue[blocks[last], Q_FLOOR2]
             gain2 -= 2.0 * far[Q_ACCEL] * far[Q_PATH]
             row[Q_REACH2] = min(row[Q_REACH2], end2 + gain2)
-            if far[Q_REACH2] < end2:  # which the firmware does not know yet
+            if far[Q_REACH2] < end2:  # the firmware has not read the queue's end yet
                 for j in range(last, i - 1, -1):
                     one = queue[blocks[j]]
                     end2 = min(one[Q_JUNCTION2], end2 + 2.0 * one[Q_ACCEL] * one[Q_PATH])

@@ -3,7 +3,7 @@
 Sources: docs/dialects.md, which also says what was not read in a firmware's own source.
 
 What a build may lack is as the machine's document says. A word that the build lacks although the
-file uses it is a barrier: file and document contradict each other.
+file uses it is `EventKind.UNKNOWN`: file and document contradict each other.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ _MOVED = commands.not_modelled(
 )
 
 STEPS: dict[str, Word] = {
-    # Temperatures, fans, messages, settings: the motion does not notice.
+    # Temperatures, fans, messages, settings: without effect on the motion.
     **words(
         "G80 M16 M17 M20 M27 M29 M30 M31 M33 M34 M42 M73 M75 M76 M77 M78 M85 M86 M87 M100 M104 "
         "M105 M106 M107 M108 M110 M113 M115 M117 M118 M119 M120 M121 M122 M123 M126 M127 M128 M129 "
@@ -103,7 +103,7 @@ STEPS: dict[str, Word] = {
         "M906 M907 M908 M909 M910 M911 M912 M913 M914 M919 M951 M1003 M3426 M7219",
         EventKind.HARMLESS,
     ),
-    # Come to rest, wait, go on from the same place. M114 does in some builds only.
+    # The machine stops, waits, and continues from the same place. M114 stops in some builds only.
     **words(
         "M3 M4 M5 M7 M8 M9 M10 M11 M12 M80 M109 M114 M190 M191 M192 M193 M240 M290 M293 M294 M303 "
         "M400 M872",
@@ -118,7 +118,7 @@ STEPS: dict[str, Word] = {
         "M605 M606 M701 M702 M704 M705 M706 M707 M708 M709 M860 M861 M862 M863 M864 M865 M866 M867 "
         "M868 M869 M915 M916 M917 M918 M928 M936 M955 M956 M957 M958 M959 M970 M971 M972 M973 M974 "
         "M975 M976 M977 M993 M994 M995 M997 M999 M1000 M1001 M1002 M1004 M1005 "
-        # M500 stores the limits and the shaper in force for good; M524 gives the print up.
+        # M500 stores the current limits and shaper permanently; M524 aborts the print.
         "M500 M524",
         EventKind.UNKNOWN,
     ),

@@ -75,7 +75,7 @@ class Planner(QueuePlanner):
             moves.limits_id[rows],
             self._limits,
             self._facts,
-            self._moves,
+            self._next_move,
             self._state,
             self._queue,
             self._count,

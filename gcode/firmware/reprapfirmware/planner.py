@@ -64,7 +64,7 @@ class RepRapPlanner(QueuePlanner):
         """Come to rest after the last move and stand for `dwell_s`."""
         phases = self._take(final=True)
         self._reset()
-        if self._moves:
+        if self._next_move:
             self._rest_s += dwell_s
         return phases
 
@@ -84,14 +84,14 @@ class RepRapPlanner(QueuePlanner):
             moves.limits_id[rows],
             self._limits,
             self._facts,
-            self._moves,
+            self._next_move,
             self._queue,
             before,
         )
         start_mm, end_mm = moves.start_mm[rows], moves.end_mm[rows]
         if self._count - before < len(start_mm):
             for row in np.flatnonzero(np.all(start_mm == end_mm, axis=1)).tolist():
-                self._still.append((self._moves + row, start_mm[row].copy()))
+                self._still.append((self._next_move + row, start_mm[row].copy()))
         if self._standing and self._count:
             self._begin()
         return problem, bad

@@ -1,4 +1,4 @@
-/** How far a job is: its place in the queue, then stage, share and time left. */
+/** A job's progress: its place in the queue, then stage, share and time left. */
 
 import { announce } from "../lib/announce.js";
 import { fill, h } from "../lib/dom.js";
@@ -19,7 +19,7 @@ export function progressPanel() {
   const update = (/** @type {any} */ job) => {
     if (job.state === "queued") {
       bar.removeAttribute("value");
-      fill(stage, capital(job.stage)); // for its turn, or for room on the disk
+      fill(stage, capital(job.stage)); // "Waiting", or "Waiting for room on the disk"
       fill(share);
       fill(left, job.queue_position ? `${counted(job.queue_position, "job")} before it` : "Next in the queue");
       return;
@@ -28,7 +28,7 @@ export function progressPanel() {
     fill(stage, capital(job.stage));
     fill(share, `${Math.floor(100 * job.progress)} %`);
     fill(left, remaining(job.eta_s) || "Time left is not known yet",
-      job.attempt > 1 ? ` · ${begunAnew(job)}` : "");
+      job.attempt > 1 ? ` · ${restartReason(job)}` : "");
     const step = Math.floor(job.progress / ANNOUNCE_EVERY);
     if (step !== said) {
       said = step;
@@ -40,7 +40,7 @@ export function progressPanel() {
 }
 
 /** Why a job that was started before began anew. @param {any} job */
-function begunAnew(job) {
+function restartReason(job) {
   return job.losses
     ? `restarted, because its worker was lost${job.losses > 1 ? ` ${job.losses} times` : ""}`
     : "restarted, because the service was restarted";

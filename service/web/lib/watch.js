@@ -71,7 +71,7 @@ async function follow(id, onJob, signal) {
     for (const event of events) {
       const lines = event.split("\n");
       const data = lines.filter((line) => line.startsWith("data:")).map((line) => line.slice(5).trimStart()).join("\n");
-      // `gone` and whatever comes later: a request says what has happened.
+      // For `gone` and unknown events, ask for the job.
       if (!lines.includes("event: job")) {
         if (data) onJob(await getJson(`/v1/jobs/${id}`, { signal }));
       } else onJob(JSON.parse(data));

@@ -84,7 +84,7 @@ export async function show({ main, signal, setTitle, params: [id] }) {
 
   draw(first);
   if (isOver(first)) return;
-  // Not waited for: the view is shown, and changes as the job does.
+  // Not awaited: the view is shown, and changes as the job does.
   watchJob(first.id, draw, signal, progress.silence).catch((error) => {
     if (!isAbort(error)) fill(fault, problemPanel(error));
   });

@@ -238,7 +238,7 @@ def test_a_sender_killed_in_between(tmp_path: Path):
         with place.sending():
             delivery = place.settled(job)
     assert (delivery.state, len(uploads(server))) == ("failed", 1)
-    assert "look at it" in (delivery.error or "")
+    assert "check the printer" in (delivery.error or "")
 
 
 @pytest.mark.parametrize(
