@@ -181,7 +181,7 @@ class SpeedBudget:
                 if at_own_pace and self._keeps_budget(one):
                     self._slow_others()
                     self._since[one] = sums[one]
-            elif has_room and max(used[one], recent) < _ROOM:
+            elif has_room and self._keeps_budget(one) and max(used[one], recent) < _ROOM:
                 highest = min(self.tops[one], _FURTHEST * self.paces.factors[one])
                 target = max(factor, min(_FASTER * factor, highest))
             if target != factor:

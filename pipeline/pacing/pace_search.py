@@ -20,7 +20,8 @@ _TRIALS = 10
 _AIM, _WITHIN, _ROOM = 0.95, 0.98, 0.92
 """Ratios of error to bound: the target, the largest accepted, and below which a class is raised."""
 _NO_WORSE = 1.1
-"""Factor by which a class that exceeds the budget at its own pace may become worse."""
+"""Factor by which a class that hardly keeps the budget at its own pace may become worse because of
+others; it is not raised itself."""
 _LANDING = 2.0
 """Multiple of the budget allowed right after travel; the feature as a whole keeps the budget."""
 _LEAP = 8.0
@@ -76,8 +77,10 @@ def search(trial: Trial, least: float, most: Factors, budget_um: float) -> PaceC
     bounds = {one: allowed_um(one, budget_um) for one in most}
     if least == 1.0:
         for one in bounds:
-            if one in tried.errors:
-                bounds[one] = max(bounds[one], _NO_WORSE * tried.errors[one].rms_um)
+            own_um = _NO_WORSE * tried.errors[one].rms_um if one in tried.errors else 0.0
+            if own_um > bounds[one]:
+                bounds[one] = own_um
+                most = most | {one: 1.0}
     climb = _Climb(least, most)
     best: Factors | None = None
     seconds = math.inf

@@ -191,7 +191,7 @@ def test_a_print_is_not_started_twice(tmp_path: Path, answer: str):
     with Listener(answers) as server:
         _, delivery = delivered(tmp_path, server, prints=True, start=True)
     assert (delivery.state, len(uploads(server))) == ("failed", 1)
-    assert "may have been started" in (delivery.error or "")
+    assert "may or may not have started" in (delivery.error or "")
 
 
 @pytest.mark.parametrize("prints", [False, True])
@@ -212,7 +212,7 @@ def test_a_sender_that_breaks_starts_no_second_print(
         _, delivery = delivered(tmp_path, server, prints=prints, start=True)
     if prints:
         assert (delivery.state, len(uploads(server))) == ("failed", 1)
-        assert "may have been started" in (delivery.error or "")
+        assert "may or may not have started" in (delivery.error or "")
     else:
         assert (delivery.state, len(uploads(server))) == ("done", 2)
 
