@@ -198,7 +198,8 @@ def test_where_setting_the_shaper_again_costs_too_much_it_is_said(
         for axis, plants in machine_of(Klipper()).axes.items()
     }
     square = "G1 X80 Y60 E.8 F6000\nG1 X80 Y80 E.8\nG1 X60 Y80 E.8\nG1 X60 Y60 E.8\n"
-    text = "G28\nM83\nG1 X60 Y60 Z1\n" + square + pauses * "PAUSE\nG1 X61\nG1 X60\n" + square
+    first_layer = "G28\nM83\nG1 X61 Y60 Z.8 F6000\nG1 X60 E.1\nG1 Z1\n"
+    text = first_layer + square + pauses * "PAUSE\nG1 X61\nG1 X60\n" + square
     result, _ = advise(text.encode(), tmp_path, machine_of(Klipper(), axes=axes), cache)
     assert result.advice is not None
     assert bool(result.advice.shapers) is kept
