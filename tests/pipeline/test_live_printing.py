@@ -132,6 +132,15 @@ def test_a_file_that_sets_the_shaper_says_why(
     assert found.ways == []
 
 
+def test_a_file_may_switch_the_shaper_off(
+    machine: Machine, cache: Path, live: Result, tmp_path: Path
+) -> None:
+    source = tmp_path / "part.gcode"
+    source.write_bytes(b"SET_INPUT_SHAPER SHAPER_FREQ_X=0 SHAPER_FREQ_Y=0\n" + PENTAGON)
+    found = simulate_live(source, machine, cache_dir=cache)
+    assert found.channels == live.channels
+
+
 def test_it_may_be_written_in_place_and_cancelled(
     machine: Machine, cache: Path, tmp_path: Path
 ) -> None:
