@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from stillpath.compensation.base import DesignError
@@ -19,6 +20,7 @@ from stillpath.pipeline.measuring.measure import Measurement
 from stillpath.pipeline.measuring.tracing import Trace
 from stillpath.pipeline.operating_point import Operation
 from stillpath.pipeline.options import DialectName, Options
+from stillpath.pipeline.parts import refuse_processed
 from stillpath.pipeline.piece_compensator import DT_S
 from stillpath.pipeline.progress import Progress, ProgressCallback
 from stillpath.pipeline.result import PrintWay, Result, StageTime
@@ -54,7 +56,7 @@ def simulate_live(
     clock = StageClock()
     with clock.stage("design"):
         design = cached_live_design(machine, cache_dir or default_cache_dir())
-    motion = FileMotion(source, plate, machine, dialect, DT_S, progress, longest_stand_s=STANDING_S)
+    motion = _sliced_motion(source, plate, machine, dialect, progress)
     live = live_filter(machine, design.taps)
     result = simulate_motion(motion, cache_dir=cache_dir, layers=layers, trace=trace, live=live)
     channels = [design.ranged(channel, machine) for channel in result.channels]
@@ -144,15 +146,27 @@ def _way(
     progress: ProgressCallback | None,
 ) -> PrintWay:
     size = source.stat().st_size
-    motion = FileMotion(
-        source, options.plate, machine, options.dialect, DT_S, progress, longest_stand_s=STANDING_S
-    )
+    motion = _sliced_motion(source, options.plate, machine, options.dialect, progress)
     measurement = Measurement(machine, DT_S, design.shaper, ("after",), size=size)
     live = LiveMotion(live_filter(machine, design.taps))
     measured(motion, live, measurement, Operation(machine), StageClock())
     measurement.finish()
     (channel,) = measurement.channels()
     return live_way(design.ranged(channel, machine), motion.time_s, size)
+
+
+def _sliced_motion(
+    source: Path,
+    plate: int | None,
+    machine: Machine,
+    dialect: DialectName | None,
+    progress: ProgressCallback | None,
+) -> FileMotion:
+    return FileMotion(
+        *(source, plate, machine, dialect, DT_S, progress),
+        longest_stand_s=STANDING_S,
+        each=partial(refuse_processed, do="print"),
+    )
 
 
 def _before(progress: ProgressCallback | None) -> ProgressCallback | None:

@@ -11,6 +11,7 @@ import numpy as np
 
 from stillpath.compensation.live_filter import LiveFilter
 from stillpath.gcode.errors import GcodeError
+from stillpath.gcode.firmware.signatures import signed_at
 from stillpath.models.machine import Machine
 from stillpath.models.schedule import OperatingPoint
 from stillpath.models.shaping import OFF
@@ -35,6 +36,11 @@ from stillpath.version import __version__
 __all__ = ["PlannedTime", "measured", "plan_file", "simulate_file", "simulate_motion"]
 
 _COLUMNS = ("t", "x", "y", "z", "e")
+_COMPENSATED = (
+    "The file is compensated: errors are those against its own lines, which lead the nozzle on "
+    "purpose, and tell nothing of the print; simulate the original, or read the report that came "
+    "with the file."
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,8 +116,16 @@ def simulate_file(
 
     Parameters and errors are those of `pipeline.compensate.compensate_file`.
     """
-    motion = FileMotion(source, plate, machine, dialect, DT_S, progress, longest_stand_s=STANDING_S)
-    return simulate_motion(motion, cache_dir=cache_dir, layers=layers, trace=trace)
+    signed: set[bool] = set()
+    motion = FileMotion(
+        *(source, plate, machine, dialect, DT_S, progress),
+        longest_stand_s=STANDING_S,
+        each=lambda block: signed.add(signed_at(block.text) is not None),
+    )
+    result = simulate_motion(motion, cache_dir=cache_dir, layers=layers, trace=trace)
+    if True in signed:
+        result.warnings.insert(0, _COMPENSATED)
+    return result
 
 
 def simulate_motion(

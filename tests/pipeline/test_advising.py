@@ -136,6 +136,7 @@ def test_read_back_it_does_what_was_predicted(
     (tmp_path / "a.gcode").write_bytes(written)
     seen = simulate_file(tmp_path / "a.gcode", machine_of(Klipper()), cache_dir=cache)
     assert seen.time_s == pytest.approx(result.time_s)
+    assert not any("simulate the original" in warning for warning in seen.warnings)
     after = next(c for c in result.channels if c.name == "after").extruding
     found = next(c for c in seen.channels if c.name == "before").extruding
     assert found.contour_rms_um == pytest.approx(after.contour_rms_um, rel=1e-9)

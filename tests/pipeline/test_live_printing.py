@@ -97,6 +97,18 @@ def test_method_live_leaves_the_file_as_it_is(
     assert [path.name for path in tmp_path.iterdir()] == ["out.gcode"]
 
 
+@pytest.mark.parametrize("options", [Options(method="live"), BOTH])
+def test_a_processed_file_is_refused_before_anything_is_predicted(
+    machine: Machine, cache: Path, tmp_path: Path, options: Options
+) -> None:
+    source, target = tmp_path / "part.gcode", tmp_path / "out.gcode"
+    source.write_bytes(PENTAGON)
+    compensate_file(source, source, machine, Options(method="shaper:mzv"), cache_dir=cache)
+    with pytest.raises(GcodeError, match="already processed by stillpath; print the original"):
+        compensate_file(source, target, machine, options, cache_dir=cache)
+    assert not target.exists()
+
+
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
