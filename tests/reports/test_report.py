@@ -48,6 +48,13 @@ def test_both_files_are_written_whole(result: Result, tmp_path: Path):
     assert read.put_back == result.put_back
 
 
+def test_a_name_that_is_not_utf8_can_be_written(result: Result, tmp_path: Path):
+    name = b"T\xfcr \xc3\xa4.gcode".decode("utf-8", "surrogateescape")
+    write_report(Result(**{**dict(result), "source_name": name}), tmp_path)
+    for file in ("report.json", "report.html"):
+        assert "T?r ä.gcode" in (tmp_path / file).read_text("utf-8")
+
+
 def test_headline_and_table(page: str):
     assert "23 times smaller" in page
     assert "153" in page
