@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -13,7 +14,7 @@ from stillpath.gcode.errors import GcodeError
 from stillpath.models.machine import Machine
 from stillpath.pipeline.clock import StageClock
 from stillpath.pipeline.file_motion import STANDING_S, FileMotion
-from stillpath.pipeline.files import default_cache_dir, replacing
+from stillpath.pipeline.files import check_unchanged, default_cache_dir, replacing
 from stillpath.pipeline.live_design import LiveDesign, cached_live_design, live_filter
 from stillpath.pipeline.live_motion import LiveMotion
 from stillpath.pipeline.measuring.measure import Measurement
@@ -66,14 +67,20 @@ def simulate_live(
     return result.model_copy(update={"channels": channels, "ways": [way], "stages": stages})
 
 
-def keep_file(source: Path, target: Path) -> None:
+def keep_file(source: Path, target: Path, began: os.stat_result) -> None:
     """Copy a file unchanged to where a compensated one would be written.
+
+    Parameters
+    ----------
+    began : os.stat_result
+        State of the source when its prediction began.
 
     Raises
     ------
     GcodeError
         The target's name is that of another kind of file.
     OSError
+        Also when another program has changed the source since.
     """
     ends = source.suffix.lower(), target.suffix.lower()
     if ends[0] != ends[1] and any(end in _PACKED for end in ends):
@@ -82,6 +89,7 @@ def keep_file(source: Path, target: Path) -> None:
         )
     with replacing(target) as temporary:
         shutil.copyfile(source, temporary)
+        check_unchanged(source, began)
 
 
 @dataclass(frozen=True, slots=True)

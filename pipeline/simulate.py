@@ -18,7 +18,7 @@ from stillpath.models.shaping import OFF
 from stillpath.pipeline.clock import StageClock
 from stillpath.pipeline.columns import npz_table
 from stillpath.pipeline.file_motion import STANDING_S, FileMotion
-from stillpath.pipeline.files import default_cache_dir
+from stillpath.pipeline.files import check_unchanged, default_cache_dir
 from stillpath.pipeline.live_motion import LiveMotion
 from stillpath.pipeline.measuring.layer_files import written_layers
 from stillpath.pipeline.measuring.measure import CHANNELS, UNCHANGED_CHANNELS, Measurement
@@ -145,7 +145,8 @@ def simulate_motion(
         shaper = cached_shaper(machine, cache_dir or default_cache_dir(), DT_S)
     operation = Operation(machine)
     names = UNCHANGED_CHANNELS if live is None else CHANNELS
-    size = motion.source.stat().st_size
+    began = motion.source.stat()
+    size = began.st_size
     with contextlib.ExitStack() as files:
         writer = None if layers is None else files.enter_context(written_layers(layers, names))
         take_layer = writer.add if writer else None
@@ -155,6 +156,7 @@ def simulate_motion(
         stream = ShapedMotion(DT_S) if live is None else LiveMotion(live)
         seen = measured(motion, stream, measurement, operation, clock)
         measurement.finish()
+        check_unchanged(motion.source, began)
         if writer is not None:
             writer.finish(motion.feature_names)
     notes = operation.notes()
