@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from stillpath.gcode.containers.opening import open_text
+from stillpath.gcode.containers.opening import open_text, rewriting
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.interpreter import Interpreter
@@ -21,6 +22,7 @@ from stillpath.models.machine import Machine
 from stillpath.models.plant_specs import ParametricMembers, RelativeMode, RelativeModesSpec
 from stillpath.models.schedule import AxisSchedule, MassSchedule
 from stillpath.models.store import load_machine
+from stillpath.pipeline.advising import removing
 from stillpath.pipeline.advising.inserting import MARK
 from stillpath.pipeline.advising.removing import remove_advice
 from stillpath.pipeline.compensate import compensate_file
@@ -174,6 +176,23 @@ def test_removed_by_command(advised: tuple[Result, bytes], tmp_path: Path) -> No
     with pytest.raises(GcodeError, match="no advice to remove"):
         remove_advice(path, path)
     assert path.read_bytes() == printed()
+
+
+def test_advice_is_not_removed_from_a_file_that_is_replaced_meanwhile(
+    advised: tuple[Result, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, again = tmp_path / "a.gcode", tmp_path / "again.gcode"
+    path.write_bytes(advised[1])
+
+    def replaced(*given: Any, **more: Any) -> Any:
+        again.write_bytes(b"; sliced again\n")
+        again.replace(path)
+        return rewriting(*given, **more)
+
+    monkeypatch.setattr(removing, "rewriting", replaced)
+    with pytest.raises(OSError, match=r"another program changed .* run it again"):
+        remove_advice(path, path)
+    assert path.read_bytes() == b"; sliced again\n"
 
 
 def test_without_a_budget_nothing_gets_worse_or_slower(tmp_path: Path, cache: Path) -> None:
