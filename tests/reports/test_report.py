@@ -169,7 +169,10 @@ def test_a_budget_says_whether_the_shaper_is_quicker(result: Result):
         assert words in budget_line(found)
 
 
-def test_a_part_that_is_compensated_is_compared_with_itself(result: Result):
+@pytest.mark.parametrize(
+    ("where", "of"), [("visible", "visible surfaces"), ("walls", "outer walls")]
+)
+def test_a_part_that_is_compensated_is_compared_with_itself(result: Result, where: str, of: str):
     """Not with the whole print as sliced, as the list of jobs did."""
     selected = {"before": 13.2, "after": 0.84, "shaper": 2.66}
     channels = [
@@ -178,6 +181,9 @@ def test_a_part_that_is_compensated_is_compared_with_itself(result: Result):
     ]
     figures = headline_figures(channels)
     assert (figures["before"], figures["after"], figures["range"]) == (13.2, 0.84, (0.84, 10.1))
+    settings = {**result.settings, "where": where}
+    part = result.model_copy(update={"channels": channels, "settings": settings})
+    assert f"Contour error of {of}, rms" in render_report(part)
 
 
 def test_features_have_the_names_of_people_in_both_files(result: Result, page: str):
