@@ -327,7 +327,8 @@ class Result(_Figures):
     peak_velocity_mm_s: float
     """Highest speed of the command [mm/s]."""
     peak_accel_mm_s2: float
-    """Highest acceleration of the command [mm/s^2]."""
+    """Highest acceleration of the command, ms by ms [mm/s^2]. What the plan's steps of speed at
+    corners ask within a ms counts, and may exceed the machine's limit."""
     emission_rms_um: float
     """Written motion against computed command, root mean square [um]."""
     emission_max_um: float
