@@ -65,7 +65,8 @@ class FirstLayer:
     below : int
         Layers below this number belong to it; -1 if the file does not mark layers.
     z_mm : float
-        Moves up to this height belong to it too; minus infinity if unknown.
+        Moves up to this height belong to it too, where no layer is marked only these; minus
+        infinity if unknown.
     """
 
     below: int = 1

@@ -14,6 +14,7 @@ from typing import Any
 from stillpath.gcode.errors import GcodeError
 from stillpath.models.machine import Machine
 from stillpath.pipeline.file_rewriting import FileRewriting, file_rewriting
+from stillpath.pipeline.files import check_unchanged
 from stillpath.pipeline.job import Job
 from stillpath.pipeline.last_check.errors import LastCheckError
 from stillpath.pipeline.live_printing import keep_file, predict_live, simulate_live
@@ -65,11 +66,12 @@ def compensate_file(
     DesignError, ModelError
         The method cannot be designed for this machine.
     """
+    began = source.stat()
     how: dict[str, Any] = {"cache_dir": cache_dir, "progress": progress}
     if options.method == "live":
         how.update(plate=options.plate, dialect=options.dialect)
         result = simulate_live(source, machine, **how, layers=layers, trace=trace)
-        keep_file(source, target)
+        keep_file(source, target, began)
     elif options.method == "advise":
         if trace is not None:
             raise GcodeError(
@@ -81,6 +83,7 @@ def compensate_file(
     else:
         # Before rewriting: the target may be the source.
         live = predict_live(source, machine, options, **how) if options.compare_live else None
+        check_unchanged(source, began)
         order = Order(machine, options, cache_dir, progress)
         result = _rewrite(source, target, order, layers, trace)
         result = live.beside(result) if live else result

@@ -255,7 +255,7 @@ class TextMotion:
 
 
 class FileMotion:
-    """Iterate over the sampled motion of a print file of any kind."""
+    """Iterate over the sampled motion of a print file of any kind; parameters as `TextMotion`."""
 
     def __init__(
         self,
@@ -267,11 +267,12 @@ class FileMotion:
         progress: ProgressCallback | None,
         *,
         longest_stand_s: float = np.inf,
+        each: Callable[[ProgramBlock], None] = lambda _block: None,
     ) -> None:
         self.source, self.machine, self._plate = source, machine, plate
         self._dialect = dialect_for(machine, dialect)
         self._asked = dialect
-        self._dt_s, self._longest_stand_s = dt_s, longest_stand_s
+        self._dt_s, self._longest_stand_s, self._each = dt_s, longest_stand_s, each
         self._progress, self._reports = progress, ProgressReports(progress)
         self.time_s = 0.0
         self.feature_names: list[str] = []
@@ -291,6 +292,7 @@ class FileMotion:
                 self._dt_s,
                 longest_stand_s=self._longest_stand_s,
                 progress=partial(self._reports.say, "planning"),
+                each=self._each,
             )
             self.feature_names = motion.reader.feature_names
             yield from motion

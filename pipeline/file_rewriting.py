@@ -62,9 +62,9 @@ def file_rewriting(
     began = source.stat()
     unpacking = progress_to(progress, "unpacking", 0.0)
     packing = progress_to(progress, "packing", 1.0)
-    with replacing(target) as temporary:
+    # The layers, for which a disk may have no room, are put in place after the check, too.
+    with replacing(target) as temporary, contextlib.ExitStack() as files:
         with (
-            contextlib.ExitStack() as files,  # a disk may have no room for the layers
             open_text(source, plate=plate, folder=target.parent, progress=unpacking) as container,
             rewriting(container, temporary, name=target, progress=packing) as text,
             tempfile.TemporaryFile(dir=target.parent) as spool,

@@ -12,7 +12,7 @@ from stillpath.compensation.base import DesignError
 from stillpath.compensation.live_filter import LiveFilter
 from stillpath.models.arrays import Array
 from stillpath.models.schedule import OperatingPoint
-from stillpath.models.shaping import OFF, Shaping
+from stillpath.models.shaping import Shaping
 from stillpath.pipeline.measuring.points import MotionSamples, part_of
 
 __all__ = ["LiveMotion"]
@@ -35,7 +35,7 @@ class LiveMotion:
         DesignError
             If the file sets the firmware's shaper: the extra steps aside for it.
         """
-        if shaping != OFF:
+        if shaping.is_on:
             raise DesignError(
                 f"the file sets the firmware's shaper ({shaping.label}), which "
                 "disables the compensation inside Klipper: remove that line from the file"

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from stillpath.compensation.base import DesignError
@@ -12,13 +14,14 @@ from stillpath.gcode.errors import GcodeError
 from stillpath.models.machine import Machine
 from stillpath.pipeline.clock import StageClock
 from stillpath.pipeline.file_motion import STANDING_S, FileMotion
-from stillpath.pipeline.files import default_cache_dir, replacing
+from stillpath.pipeline.files import check_unchanged, default_cache_dir, replacing
 from stillpath.pipeline.live_design import LiveDesign, cached_live_design, live_filter
 from stillpath.pipeline.live_motion import LiveMotion
 from stillpath.pipeline.measuring.measure import Measurement
 from stillpath.pipeline.measuring.tracing import Trace
 from stillpath.pipeline.operating_point import Operation
 from stillpath.pipeline.options import DialectName, Options
+from stillpath.pipeline.parts import refuse_processed
 from stillpath.pipeline.piece_compensator import DT_S
 from stillpath.pipeline.progress import Progress, ProgressCallback
 from stillpath.pipeline.result import PrintWay, Result, StageTime
@@ -54,7 +57,7 @@ def simulate_live(
     clock = StageClock()
     with clock.stage("design"):
         design = cached_live_design(machine, cache_dir or default_cache_dir())
-    motion = FileMotion(source, plate, machine, dialect, DT_S, progress, longest_stand_s=STANDING_S)
+    motion = _sliced_motion(source, plate, machine, dialect, progress)
     live = live_filter(machine, design.taps)
     result = simulate_motion(motion, cache_dir=cache_dir, layers=layers, trace=trace, live=live)
     channels = [design.ranged(channel, machine) for channel in result.channels]
@@ -64,14 +67,20 @@ def simulate_live(
     return result.model_copy(update={"channels": channels, "ways": [way], "stages": stages})
 
 
-def keep_file(source: Path, target: Path) -> None:
+def keep_file(source: Path, target: Path, began: os.stat_result) -> None:
     """Copy a file unchanged to where a compensated one would be written.
+
+    Parameters
+    ----------
+    began : os.stat_result
+        State of the source when its prediction began.
 
     Raises
     ------
     GcodeError
         The target's name is that of another kind of file.
     OSError
+        Also when another program has changed the source since.
     """
     ends = source.suffix.lower(), target.suffix.lower()
     if ends[0] != ends[1] and any(end in _PACKED for end in ends):
@@ -80,6 +89,7 @@ def keep_file(source: Path, target: Path) -> None:
         )
     with replacing(target) as temporary:
         shutil.copyfile(source, temporary)
+        check_unchanged(source, began)
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,15 +154,27 @@ def _way(
     progress: ProgressCallback | None,
 ) -> PrintWay:
     size = source.stat().st_size
-    motion = FileMotion(
-        source, options.plate, machine, options.dialect, DT_S, progress, longest_stand_s=STANDING_S
-    )
+    motion = _sliced_motion(source, options.plate, machine, options.dialect, progress)
     measurement = Measurement(machine, DT_S, design.shaper, ("after",), size=size)
     live = LiveMotion(live_filter(machine, design.taps))
     measured(motion, live, measurement, Operation(machine), StageClock())
     measurement.finish()
     (channel,) = measurement.channels()
     return live_way(design.ranged(channel, machine), motion.time_s, size)
+
+
+def _sliced_motion(
+    source: Path,
+    plate: int | None,
+    machine: Machine,
+    dialect: DialectName | None,
+    progress: ProgressCallback | None,
+) -> FileMotion:
+    return FileMotion(
+        *(source, plate, machine, dialect, DT_S, progress),
+        longest_stand_s=STANDING_S,
+        each=partial(refuse_processed, do="print"),
+    )
 
 
 def _before(progress: ProgressCallback | None) -> ProgressCallback | None:

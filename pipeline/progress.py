@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-__all__ = ["Cancelled", "Progress", "ProgressCallback", "ProgressReports", "progress_to"]
+__all__ = ["Cancelled", "Progress", "ProgressCallback", "ProgressReports", "progress_to", "within"]
 
 
 _SURE = 0.02
@@ -81,3 +81,15 @@ def progress_to(
             callback(Progress(stage, fraction, 0.0, time.monotonic() - began, None))
 
     return tell
+
+
+def within(callback: ProgressCallback | None, low: float, high: float) -> ProgressCallback | None:
+    """Return a callback for a part of the work; its share done counts from `low` to `high`."""
+    if callback is None:
+        return None
+    tell = callback
+
+    def say(now: Progress) -> None:
+        tell(replace(now, fraction=low + (high - low) * now.fraction, eta_s=None))
+
+    return say

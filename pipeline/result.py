@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, field_validator
 
 __all__ = [
     "NOTHING_COMPENSATED",
@@ -301,7 +301,7 @@ class Result(_Figures):
     settings: dict[str, str | float]
     """Options of the job by name; `method` is always there."""
     source_name: str
-    """Name of the file."""
+    """Name of the file; each byte of it that is not UTF-8 is a question mark."""
     channels: list[Channel]
     """Figures of the whole print, by channel."""
     best_shaper: str
@@ -327,7 +327,8 @@ class Result(_Figures):
     peak_velocity_mm_s: float
     """Highest speed of the command [mm/s]."""
     peak_accel_mm_s2: float
-    """Highest acceleration of the command [mm/s^2]."""
+    """Highest acceleration of the command, ms by ms [mm/s^2]. What the plan's steps of speed at
+    corners ask within a ms counts, and may exceed the machine's limit."""
     emission_rms_um: float
     """Written motion against computed command, root mean square [um]."""
     emission_max_um: float
@@ -382,6 +383,12 @@ class Result(_Figures):
     """Why the file cannot be printed live, if a comparison was requested; empty: it can."""
     last_check: LastCheckFigures | None = None
     """What the last check compared; null where nothing was compensated."""
+
+    @field_validator("source_name")
+    @classmethod
+    def _printable(cls, name: str) -> str:
+        # Python has surrogates for such bytes, which neither JSON nor a console can hold.
+        return name.encode("utf-8", "replace").decode("utf-8")
 
 
 NOTHING_COMPENSATED: dict[str, Any] = {

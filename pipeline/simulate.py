@@ -11,13 +11,14 @@ import numpy as np
 
 from stillpath.compensation.live_filter import LiveFilter
 from stillpath.gcode.errors import GcodeError
+from stillpath.gcode.firmware.signatures import signed_at
 from stillpath.models.machine import Machine
 from stillpath.models.schedule import OperatingPoint
 from stillpath.models.shaping import OFF
 from stillpath.pipeline.clock import StageClock
 from stillpath.pipeline.columns import npz_table
 from stillpath.pipeline.file_motion import STANDING_S, FileMotion
-from stillpath.pipeline.files import default_cache_dir
+from stillpath.pipeline.files import check_unchanged, default_cache_dir
 from stillpath.pipeline.live_motion import LiveMotion
 from stillpath.pipeline.measuring.layer_files import written_layers
 from stillpath.pipeline.measuring.measure import CHANNELS, UNCHANGED_CHANNELS, Measurement
@@ -35,6 +36,11 @@ from stillpath.version import __version__
 __all__ = ["PlannedTime", "measured", "plan_file", "simulate_file", "simulate_motion"]
 
 _COLUMNS = ("t", "x", "y", "z", "e")
+_COMPENSATED = (
+    "The file is compensated: errors are those against its own lines, which lead the nozzle on "
+    "purpose, and tell nothing of the print; simulate the original, or read the report that came "
+    "with the file."
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,8 +116,16 @@ def simulate_file(
 
     Parameters and errors are those of `pipeline.compensate.compensate_file`.
     """
-    motion = FileMotion(source, plate, machine, dialect, DT_S, progress, longest_stand_s=STANDING_S)
-    return simulate_motion(motion, cache_dir=cache_dir, layers=layers, trace=trace)
+    signed: set[bool] = set()
+    motion = FileMotion(
+        *(source, plate, machine, dialect, DT_S, progress),
+        longest_stand_s=STANDING_S,
+        each=lambda block: signed.add(signed_at(block.text) is not None),
+    )
+    result = simulate_motion(motion, cache_dir=cache_dir, layers=layers, trace=trace)
+    if True in signed:
+        result.warnings.insert(0, _COMPENSATED)
+    return result
 
 
 def simulate_motion(
@@ -131,7 +145,8 @@ def simulate_motion(
         shaper = cached_shaper(machine, cache_dir or default_cache_dir(), DT_S)
     operation = Operation(machine)
     names = UNCHANGED_CHANNELS if live is None else CHANNELS
-    size = motion.source.stat().st_size
+    began = motion.source.stat()
+    size = began.st_size
     with contextlib.ExitStack() as files:
         writer = None if layers is None else files.enter_context(written_layers(layers, names))
         take_layer = writer.add if writer else None
@@ -141,6 +156,7 @@ def simulate_motion(
         stream = ShapedMotion(DT_S) if live is None else LiveMotion(live)
         seen = measured(motion, stream, measurement, operation, clock)
         measurement.finish()
+        check_unchanged(motion.source, began)
         if writer is not None:
             writer.finish(motion.feature_names)
     notes = operation.notes()

@@ -17,15 +17,19 @@ from stillpath.gcode.errors import GcodeError
 from stillpath.models.machine import Machine
 from stillpath.pipeline.columns import Table, csv_table, npz_table
 from stillpath.pipeline.compensate import compensate_file
+from stillpath.pipeline.live_printing import simulate_live
 from stillpath.pipeline.measuring.tracing import Trace
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.piece_compensator import DT_S
-from stillpath.pipeline.progress import ProgressCallback
+from stillpath.pipeline.progress import ProgressCallback, within
 from stillpath.pipeline.simulate import simulate_file
 
 __all__ = ["TrajectoryFormat", "write_trajectories"]
 
 TrajectoryFormat = Literal["csv", "npz"]
+
+_ADVISED = 0.8
+"""Share of the work after which a file is advised, and its motion can be read."""
 
 
 def write_trajectories(
@@ -56,7 +60,7 @@ def write_trajectories(
         Text (some 110 bytes a row, lengths to 0.1 um), or NumPy arrays.
     window_s : (start, stop)
         On the time axis of reports: that of the written file, with standstills cut to 2 s. A stop
-        of None is the end.
+        of None, or infinity, is the end.
     cache_dir, progress
         As in `compensate_file`.
 
@@ -105,14 +109,18 @@ def _run(
     cache_dir: Path | None,
     progress: ProgressCallback | None,
 ) -> None:
-    """Compensate a file again; the motion of an advised file is read from the written one."""
+    """Run a job again; the motion of an advised file is read from the written one."""
     options = options.model_copy(update={"compare_live": False})
-    how: dict[str, Any] = {"cache_dir": cache_dir, "progress": progress, "trace": window.add}
+    how: dict[str, Any] = {"cache_dir": cache_dir, "trace": window.add}
     if options.method == "advise":
-        compensate_file(source, written, machine, options, cache_dir=cache_dir)
-        simulate_file(written, machine, dialect=options.dialect, **how)
+        first, then = within(progress, 0.0, _ADVISED), within(progress, _ADVISED, 1.0)
+        compensate_file(source, written, machine, options, cache_dir=cache_dir, progress=first)
+        simulate_file(written, machine, dialect=options.dialect, progress=then, **how)
+    elif options.method == "live":
+        how.update(plate=options.plate, dialect=options.dialect)
+        simulate_live(source, machine, progress=progress, **how)
     else:
-        compensate_file(source, written, machine, options, **how)
+        compensate_file(source, written, machine, options, progress=progress, **how)
 
 
 class _Window:
@@ -123,7 +131,8 @@ class _Window:
     ) -> None:
         self._table, self._names = table, names
         self._first = round(np.ceil(start_s / DT_S - 1e-6))
-        self._stop = None if stop_s is None else round(np.ceil(stop_s / DT_S - 1e-6))
+        stop = np.inf if stop_s is None else np.ceil(stop_s / DT_S - 1e-6)
+        self._stop = None if np.isinf(stop) else round(stop)
         self.rows = 0
         self.end_s = 0.0
 

@@ -67,7 +67,7 @@ def render_report(result: Result) -> str:
         result=result,
         channels=channels,
         writes="after" in channels and result.settings.get("method") != "live",
-        headline=headline_figures(result.channels),
+        headline=headline_figures(result.channels, result.settings.get("where")),
         rows=_rows(result.channels),
         features=features[:_FEATURES_SHOWN],
         widest=_widest(features),
@@ -79,18 +79,21 @@ def render_report(result: Result) -> str:
     )
 
 
-def headline_figures(channels: Sequence[Channel]) -> dict[str, Any]:
+def headline_figures(
+    channels: Sequence[Channel], where: str | float | None = None
+) -> dict[str, Any]:
     """Contour error rms while extruding, by channel, and how many times smaller it became.
 
     Of a file that extrudes nothing, such as a coupon drawn with a pen, that of all motion; of one
-    that is compensated in part, that of the features that were chosen.
+    that is compensated in part, that of the features that were chosen (the setting `where`).
     """
     extrudes = any(channel.extruding.contour_max_um > 0 for channel in channels)
     scope = "extruding" if extrudes else "all_motion"
     rms = {channel.name: getattr(channel, scope).contour_rms_um for channel in channels}
     selected = {c.name: c.selected_rms_um for c in channels if c.selected_rms_um is not None}
     rms.update(selected)
-    of = "of visible surfaces" if selected else "while extruding"
+    chosen = "of outer walls" if where == "walls" else "of visible surfaces"
+    of = chosen if selected else "while extruding"
     before, after = rms.get("before"), rms.get("after")
     ratio = before / after if before and after else None
     ranges = {channel.name: channel.contour_range_um for channel in channels}

@@ -7,7 +7,7 @@ from pathlib import Path
 from stillpath.gcode.containers.opening import open_text, rewriting
 from stillpath.gcode.errors import GcodeError
 from stillpath.pipeline.advising.inserting import MARK
-from stillpath.pipeline.files import replacing
+from stillpath.pipeline.files import check_unchanged, replacing
 
 __all__ = ["remove_advice"]
 
@@ -32,8 +32,10 @@ def remove_advice(source: Path, target: Path, *, plate: int | None = None) -> in
     ------
     GcodeError
         The file contains no advice.
+    OSError
+        Also when another program changes the source meanwhile.
     """
-    removed = 0
+    removed, began = 0, source.stat()
     with (
         replacing(target) as temporary,
         open_text(source, plate=plate, folder=target.parent) as container,
@@ -49,4 +51,5 @@ def remove_advice(source: Path, target: Path, *, plate: int | None = None) -> in
             raise GcodeError(
                 f"no line of the file holds {MARK.decode()!r}: there is no advice to remove"
             )
+        check_unchanged(source, began)
     return removed

@@ -28,7 +28,7 @@ from stillpath.gcode.pacing import (
 from stillpath.gcode.pieces import Piece
 from stillpath.gcode.slicers.features import feature_name, feature_title
 from stillpath.gcode.types import Moves
-from stillpath.models.machine import Machine
+from stillpath.models.machine import CommandLimits, Machine
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.pipeline.measuring.set_errors import ErrorSum
 from stillpath.pipeline.options import LEAST_BUDGET_UM, Options
@@ -271,8 +271,8 @@ class SpeedBudget:
         )
 
     def warnings(self, sums: Mapping[int, ErrorSum], names: Sequence[str]) -> list[str]:
-        """Return warnings about classes that exceed the budget."""
-        warnings = []
+        """Return warnings about classes that exceed the budget, and about assumed limits."""
+        warnings = self._assumed()
         for one, found in sorted(sums.items()):
             error = found.worst
             if error.rms_um <= _ABOVE * allowed_um(one, self.budget_um):
@@ -296,6 +296,20 @@ class SpeedBudget:
                 "them."
             )
         return warnings
+
+    def _assumed(self) -> list[str]:
+        """Return a warning if anything is quicker because of limits that nobody stated."""
+        accel_mm_s2 = self.machine.command.accel_mm_s2
+        quicker = any(self._mean_factor(one) > _ABOVE for one in self.factors)
+        if not quicker or accel_mm_s2 != CommandLimits().accel_mm_s2:
+            return []
+        warning = (
+            f"Moves are quicker than in the file, up to {top_limits(self.machine).accel_mm_s2:.0f} "
+            f"mm/s2, because the motors are assumed to bear {accel_mm_s2:.0f} mm/s2 (the default "
+            "of command.accel_mm_s2): measure what they bear (motor-test), or put it there, before "
+            "you print this file."
+        )
+        return [warning]
 
 
 def _tops(samples: list[Sample], machine: Machine) -> Factors:

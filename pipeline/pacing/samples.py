@@ -119,9 +119,11 @@ def _items(
 def _seen(known: FirstLayer, moves: Moves) -> FirstLayer:
     """Return what is known about the first layer after these moves."""
     below = max(known.below, min(int(np.max(moves.layer, initial=-1)), 1))
-    prints = moves.prints & (moves.layer >= 0)
-    if np.isfinite(known.z_mm) or not np.any(prints):
-        return FirstLayer(below, known.z_mm)
+    # What is printed before the first mark, such as a purge line, counts only where there is none.
+    z_mm = -np.inf if known.below < 0 <= below else known.z_mm
+    prints = moves.prints & (moves.layer >= min(below, 0))
+    if np.isfinite(z_mm) or not np.any(prints):
+        return FirstLayer(below, z_mm)
     return FirstLayer(below, float(moves.end_mm[np.argmax(prints), 2]))
 
 

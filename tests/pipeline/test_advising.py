@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from stillpath.gcode.containers.opening import open_text
+from stillpath.gcode.containers.opening import open_text, rewriting
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.interpreter import Interpreter
@@ -21,6 +22,7 @@ from stillpath.models.machine import Machine
 from stillpath.models.plant_specs import ParametricMembers, RelativeMode, RelativeModesSpec
 from stillpath.models.schedule import AxisSchedule, MassSchedule
 from stillpath.models.store import load_machine
+from stillpath.pipeline.advising import removing
 from stillpath.pipeline.advising.inserting import MARK
 from stillpath.pipeline.advising.removing import remove_advice
 from stillpath.pipeline.compensate import compensate_file
@@ -136,6 +138,7 @@ def test_read_back_it_does_what_was_predicted(
     (tmp_path / "a.gcode").write_bytes(written)
     seen = simulate_file(tmp_path / "a.gcode", machine_of(Klipper()), cache_dir=cache)
     assert seen.time_s == pytest.approx(result.time_s)
+    assert not any("simulate the original" in warning for warning in seen.warnings)
     after = next(c for c in result.channels if c.name == "after").extruding
     found = next(c for c in seen.channels if c.name == "before").extruding
     assert found.contour_rms_um == pytest.approx(after.contour_rms_um, rel=1e-9)
@@ -175,6 +178,23 @@ def test_removed_by_command(advised: tuple[Result, bytes], tmp_path: Path) -> No
     assert path.read_bytes() == printed()
 
 
+def test_advice_is_not_removed_from_a_file_that_is_replaced_meanwhile(
+    advised: tuple[Result, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, again = tmp_path / "a.gcode", tmp_path / "again.gcode"
+    path.write_bytes(advised[1])
+
+    def replaced(*given: Any, **more: Any) -> Any:
+        again.write_bytes(b"; sliced again\n")
+        again.replace(path)
+        return rewriting(*given, **more)
+
+    monkeypatch.setattr(removing, "rewriting", replaced)
+    with pytest.raises(OSError, match=r"another program changed .* run it again"):
+        remove_advice(path, path)
+    assert path.read_bytes() == b"; sliced again\n"
+
+
 def test_without_a_budget_nothing_gets_worse_or_slower(tmp_path: Path, cache: Path) -> None:
     data = printed(2).rstrip(b"\n")  # the last line has no end
     result, written = advise(data, tmp_path, machine_of(Klipper()), cache)
@@ -198,7 +218,8 @@ def test_where_setting_the_shaper_again_costs_too_much_it_is_said(
         for axis, plants in machine_of(Klipper()).axes.items()
     }
     square = "G1 X80 Y60 E.8 F6000\nG1 X80 Y80 E.8\nG1 X60 Y80 E.8\nG1 X60 Y60 E.8\n"
-    text = "G28\nM83\nG1 X60 Y60 Z1\n" + square + pauses * "PAUSE\nG1 X61\nG1 X60\n" + square
+    first_layer = "G28\nM83\nG1 X61 Y60 Z.8 F6000\nG1 X60 E.1\nG1 Z1\n"
+    text = first_layer + square + pauses * "PAUSE\nG1 X61\nG1 X60\n" + square
     result, _ = advise(text.encode(), tmp_path, machine_of(Klipper(), axes=axes), cache)
     assert result.advice is not None
     assert bool(result.advice.shapers) is kept

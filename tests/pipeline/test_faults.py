@@ -41,25 +41,38 @@ def test_a_fault_of_ours_costs_one_piece(
     check_file(data, written, load_machine("ender3"))
 
 
-@pytest.mark.parametrize("method", ["fbf", "advise"])
-def test_a_file_that_is_replaced_meanwhile_stays(method: str, tmp_path: Path, cache: Path) -> None:
-    source = tmp_path / "in.gcode"
+@pytest.mark.parametrize(
+    "options",
+    [Options(), Options(method="advise"), Options(method="live"), Options(compare_live=True)],
+)
+@pytest.mark.parametrize("name", ["in.gcode", "out.gcode"])
+def test_a_file_that_is_replaced_meanwhile_stays(
+    options: Options, name: str, tmp_path: Path, cache: Path
+) -> None:
+    """And so does the report that was there, with its layers."""
+    source, report = tmp_path / "in.gcode", tmp_path / "report"
     source.write_text(HEAD + 3 * (SQUARE + STOP))
+    report.mkdir()
+    for layers in ("layers.json", "layers.bin"):
+        (report / layers).write_text("of an earlier file")
 
     def replace(_: Progress) -> None:
         again = tmp_path / "again.gcode"
-        again.write_text("; sliced again\n")
-        again.replace(source)
+        if source.read_text() != "; sliced again\n":
+            again.write_text("; sliced again\n")
+            again.replace(source)
 
     with pytest.raises(OSError, match=r"another program changed .* run it again") as caught:
         compensate_file(
-            *(source, source, load_machine("ender3"), Options.model_validate({"method": method})),
+            *(source, tmp_path / name, load_machine("ender3"), options),
             cache_dir=cache,
             progress=replace,
+            layers=report,
         )
     assert caught.value.filename == str(source)
     assert source.read_text() == "; sliced again\n"
     assert [path.name for path in tmp_path.iterdir() if path.is_file()] == ["in.gcode"]
+    assert {path.read_text() for path in report.iterdir()} == {"of an earlier file"}
 
 
 @pytest.mark.parametrize("name", ["ender3", "generic-corexy"])

@@ -97,6 +97,18 @@ def test_method_live_leaves_the_file_as_it_is(
     assert [path.name for path in tmp_path.iterdir()] == ["out.gcode"]
 
 
+@pytest.mark.parametrize("options", [Options(method="live"), BOTH])
+def test_a_processed_file_is_refused_before_anything_is_predicted(
+    machine: Machine, cache: Path, tmp_path: Path, options: Options
+) -> None:
+    source, target = tmp_path / "part.gcode", tmp_path / "out.gcode"
+    source.write_bytes(PENTAGON)
+    compensate_file(source, source, machine, Options(method="shaper:mzv"), cache_dir=cache)
+    with pytest.raises(GcodeError, match="already processed by stillpath; print the original"):
+        compensate_file(source, target, machine, options, cache_dir=cache)
+    assert not target.exists()
+
+
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
@@ -130,6 +142,15 @@ def test_a_file_that_sets_the_shaper_says_why(
     found, _ = compensated(line + PENTAGON, tmp_path, cache, machine, compare_live=True)
     assert found.not_live.startswith("the file sets the firmware's shaper (mzv")
     assert found.ways == []
+
+
+def test_a_file_may_switch_the_shaper_off(
+    machine: Machine, cache: Path, live: Result, tmp_path: Path
+) -> None:
+    source = tmp_path / "part.gcode"
+    source.write_bytes(b"SET_INPUT_SHAPER SHAPER_FREQ_X=0 SHAPER_FREQ_Y=0\n" + PENTAGON)
+    found = simulate_live(source, machine, cache_dir=cache)
+    assert found.channels == live.channels
 
 
 def test_it_may_be_written_in_place_and_cancelled(

@@ -159,8 +159,24 @@ def test_a_remedy_is_one_that_can_be_given(budget_um: float, remedy: str) -> Non
     paces = replace(budget(wall=4.0), budget_um=budget_um)
     over = {WALL: sums(12.0, 90.0)}
     paces.correct(over)
-    (warning,) = paces.warnings(over, ["Perimeter"])
+    *_, warning = paces.warnings(over, ["Perimeter"])
     assert remedy in warning
+
+
+@pytest.mark.parametrize(
+    ("accel_mm_s2", "factor", "count"), [(20_000.0, 4.0, 1), (20_000.0, 1.0, 0), (4500.0, 4.0, 0)]
+)
+def test_limits_that_nobody_measured_are_named_where_they_are_used(
+    accel_mm_s2: float, factor: float, count: int
+) -> None:
+    machine = load_machine("ender3")
+    command = machine.command.model_copy(update={"accel_mm_s2": accel_mm_s2})
+    paces = replace(budget(wall=factor), machine=machine.model_copy(update={"command": command}))
+    within = {WALL: sums(9.0, 90.0)}
+    paces.correct(within)
+    warnings = paces.warnings(within, ["Perimeter"])
+    assert [w for w in warnings if "up to 14000 mm/s2" in w and "motor-test" in w] == warnings
+    assert len(warnings) == count
 
 
 def test_every_plant_of_the_larger_set_is_judged() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 
 import numpy as np
+import pytest
 
 from stillpath.gcode.pacing import AS_SLICED, FirstLayer
 from stillpath.models.store import load_machine
@@ -33,8 +34,10 @@ def heights(samples: FileSamples) -> set[float]:
     return found
 
 
-def test_the_first_layer_is_left_alone() -> None:
-    found = taken(PURGE + layer(0.2) + layer(0.4) + layer(0.6))
+@pytest.mark.parametrize("between", ["", "G28\n"])
+def test_the_first_layer_is_left_alone(between: str) -> None:
+    """The purge line is higher, and belongs to no layer."""
+    found = taken(PURGE + between + layer(0.2) + layer(0.4) + layer(0.6))
     assert found.first_layer == FirstLayer(1, 0.2)
     assert min(heights(found)) == 0.4
 
@@ -50,7 +53,7 @@ def test_every_object_has_a_first_layer() -> None:
     assert heights(found) == {0.4}
 
 
-def test_without_layers_there_is_no_first_one() -> None:
-    found = taken(PURGE + layer(0.2, mark=""))
-    assert found.first_layer == FirstLayer(-1)
-    assert heights(found) == {0.2, 0.3}
+def test_without_marks_all_up_to_the_first_height_is_left_alone() -> None:
+    found = taken(PURGE + "".join(layer(z_mm, mark="") for z_mm in (0.2, 0.4, 0.6)))
+    assert found.first_layer == FirstLayer(-1, 0.3)
+    assert min(heights(found)) == 0.4

@@ -15,9 +15,11 @@ from stillpath.gcode.firmware.writing import StreamWriter
 from stillpath.models.store import load_machine
 from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.options import Options
+from stillpath.pipeline.progress import Cancelled, Progress
 from stillpath.pipeline.simulate import plan_file
 from stillpath.pipeline.trajectories import TrajectoryFormat, write_trajectories
 from stillpath.simulation.measures import contour_error
+from tests.gcode.container_files import binary, package
 from tests.gcode.cutting import HEAD
 from tests.gcode.prints import polygon
 
@@ -104,6 +106,42 @@ def test_a_part_of_it_as_text(source: Path, tmp_path: Path, cache: Path, options
         column = np.array([float(row[name]) for row in read])
         assert column == pytest.approx(values[250:750], abs=6e-3)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["in.gcode", "p.csv", "w.npz"]
+
+
+def test_of_a_live_job_to_its_end_in_any_container(tmp_path: Path, cache: Path) -> None:
+    machine, options, text = load_machine("ender3"), Options(method="live"), SMALL.encode()
+    sources = {"a.gcode": text, "b.bgcode": binary(text), "c.gcode.3mf": package({1: text})}
+    found, target = [], tmp_path / "t.csv"
+    for name, data in sources.items():
+        source = tmp_path / name
+        source.write_bytes(data)
+        write_trajectories(
+            source, target, machine, options, window_s=(0.5, np.inf), cache_dir=cache
+        )
+        found.append(target.read_text())
+    assert found == [found[0]] * 3
+
+
+def test_an_advised_file_tells_its_progress_and_can_be_cancelled(
+    source: Path, tmp_path: Path, cache: Path
+) -> None:
+    seen: list[Progress] = []
+
+    def cancel(progress: Progress) -> None:
+        seen.append(progress)
+        if progress.fraction > 0.85:
+            raise Cancelled
+
+    with pytest.raises(Cancelled):
+        write_trajectories(
+            *(source, tmp_path / "t.csv", load_machine("ender3"), Options(method="advise")),
+            cache_dir=cache,
+            progress=cancel,
+        )
+    read = next(k for k, one in enumerate(seen) if one.stage == "planning")
+    assert any(one.stage == "verifying" for one in seen[:read])
+    assert max(one.fraction for one in seen[:read]) <= 0.8 <= seen[read].fraction
+    assert [p.name for p in tmp_path.iterdir()] == ["in.gcode"]
 
 
 def test_the_same_bytes(source: Path, tmp_path: Path, cache: Path) -> None:

@@ -48,6 +48,13 @@ def test_both_files_are_written_whole(result: Result, tmp_path: Path):
     assert read.put_back == result.put_back
 
 
+def test_a_name_that_is_not_utf8_can_be_written(result: Result, tmp_path: Path):
+    name = b"T\xfcr \xc3\xa4.gcode".decode("utf-8", "surrogateescape")
+    write_report(Result(**{**dict(result), "source_name": name}), tmp_path)
+    for file in ("report.json", "report.html"):
+        assert "T?r ä.gcode" in (tmp_path / file).read_text("utf-8")
+
+
 def test_headline_and_table(page: str):
     assert "23 times smaller" in page
     assert "153" in page
@@ -162,7 +169,10 @@ def test_a_budget_says_whether_the_shaper_is_quicker(result: Result):
         assert words in budget_line(found)
 
 
-def test_a_part_that_is_compensated_is_compared_with_itself(result: Result):
+@pytest.mark.parametrize(
+    ("where", "of"), [("visible", "visible surfaces"), ("walls", "outer walls")]
+)
+def test_a_part_that_is_compensated_is_compared_with_itself(result: Result, where: str, of: str):
     """Not with the whole print as sliced, as the list of jobs did."""
     selected = {"before": 13.2, "after": 0.84, "shaper": 2.66}
     channels = [
@@ -171,6 +181,9 @@ def test_a_part_that_is_compensated_is_compared_with_itself(result: Result):
     ]
     figures = headline_figures(channels)
     assert (figures["before"], figures["after"], figures["range"]) == (13.2, 0.84, (0.84, 10.1))
+    settings = {**result.settings, "where": where}
+    part = result.model_copy(update={"channels": channels, "settings": settings})
+    assert f"Contour error of {of}, rms" in render_report(part)
 
 
 def test_features_have_the_names_of_people_in_both_files(result: Result, page: str):

@@ -224,9 +224,12 @@ def test_list_page_and_report_say_the_same(
     page.goto(f"{visitor.url}/#/jobs/{job['id']}")
     shown = [page.locator(f".headline .{name}") for name in ("before", "after")]
     assert listed == [figure.inner_text() for figure in shown]
+    label = page.locator(".headline .first .label").inner_text()
+    assert ("of outer walls" in label) is ("where" in options)
     features = page.get_by_role("region", name="Contour error by feature").inner_text()
     assert "Outer wall (WALL-OUTER)" in features
     page.goto(visitor.url + job["links"]["report"])
+    expect(page.locator(".figure.main .label")).to_have_text(label, ignore_case=True)
     expect(page.locator(".figure.main .big")).to_have_text(f"{listed[0]} → {listed[1]} µm")
     expect(page.get_by_role("rowheader", name="outer wall (WALL-OUTER)")).to_be_visible()
     if options.get("method") == "none":

@@ -19,7 +19,8 @@ export function headline(report, channels) {
   for (const c of selected) rms[c.name] = c.selected_rms_um;
   const ranges = extrudes ? Object.fromEntries(channels.map((c) => [c.name, c.contour_range_um])) : {};
   const said = (/** @type {string} */ name) => umOrRange(rms[name], ranges[name]);
-  const label = `Contour error ${extrudes ? (selected.length ? "of visible surfaces" : "while extruding") : "of all motion (nothing is extruded)"}, rms`;
+  const chosen = report.settings?.where === "walls" ? "of outer walls" : "of visible surfaces";
+  const label = `Contour error ${extrudes ? (selected.length ? chosen : "while extruding") : "of all motion (nothing is extruded)"}, rms`;
   const rubbing = extrudes ? Object.fromEntries(channels.map((c) => [c.name, c.contour_rubbing_um])) : {};
   const ifGuidesRub = rubbing.after ? `. If guides rub, which was not measured: up to ${um(rubbing.after)} (${um(rubbing.before)} as sliced)` : "";
   const ratio = rms.before / rms.after;
