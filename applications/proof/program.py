@@ -109,7 +109,8 @@ class Program:
     """
 
     def __init__(self, machine: Machine, settings: PrintSettings) -> None:
-        self._stream_commands = adapter(machine).stream_commands()
+        self._firmware_adapter = adapter(machine)
+        self._stream_commands = self._firmware_adapter.stream_commands()
         extruder = machine.firmware.hotend
         self._machine, self._settings = machine, settings
         self.width_mm = 1.125 * extruder.nozzle_diameter_mm
@@ -164,8 +165,8 @@ class Program:
         """Restore limits and shaper, switch heaters off, move the nozzle up and aside."""
         machine = self._machine
         self._retract()
-        self.limit_accel(machine.firmware.largest_accel_mm_s2)
-        self._add(*(self._stream_commands.shaper_on or b"").decode().splitlines())
+        own = self._stream_commands.limits(self._firmware_adapter.initial_limits())
+        self._add(*(own + (self._stream_commands.shaper_on or b"")).decode().splitlines())
         if self._settings.end_gcode is not None:
             self._add(*self._settings.end_gcode.splitlines())
             return

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from stillpath.applications.machines.checks import with_firmware
 from stillpath.applications.proof.coupon import coupon_program
 from stillpath.applications.proof.drive import ringing_mode
 from stillpath.applications.proof.program import PrintSettings
+from stillpath.applications.proof.recorders import RingSettings
+from stillpath.applications.proof.ring_test import RingTest
 from stillpath.applications.proof.tower import tower_program, write_tower
 from stillpath.cli.main import run
 from stillpath.gcode.firmware.klipper.planner import Planner
 from stillpath.gcode.firmware.planning import join_phases
+from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.types import Moves, joined
 from stillpath.models.errors import ModelError
 from stillpath.models.firmware.klipper import FirmwareShaper
@@ -26,6 +32,7 @@ from stillpath.simulation.response import response
 from tests.gcode.cutting import blocks_of
 
 SETTINGS = PrintSettings()
+EXAMPLES = Path(__file__).parents[2] / "examples" / "firmware"
 COUPONS = ("voron-v24-250", "generic-bedslinger", "annex-k3", "taz6-x")
 """Machines whose coupons `test_proof_readback` reads back as well; of the others, towers."""
 
@@ -80,6 +87,41 @@ def test_planned_prints_are_sound(what, name):
     assert moves.speed_mm_s.max() <= max(limits.max_velocity_mm_s, 200)
     if what == "coupon":
         assert 5 * 60 <= float(time_s) <= 10 * 60
+
+
+@pytest.mark.parametrize("what", ["coupon", "tower x", "tower y", "ring test"])
+@pytest.mark.parametrize("kind", ["marlin", "reprapfirmware"])
+def test_each_axis_keeps_its_own_limits(kind, what):
+    """On a bed slinger whose bed may less than its head."""
+    machine = with_limits_of_each_axis(kind)
+    if what == "ring test":
+        text = RingTest(machine, RingSettings()).text()
+    else:
+        text = text_of(what, machine)
+    blocks = blocks_of(text.encode(), machine)
+    own = adapter(machine).initial_limits()
+    limits = [one for block in blocks for one in block.limits]
+    assert {one.accel_x_mm_s2 for one in limits} == {own.accel_x_mm_s2}
+    assert {one.accel_y_mm_s2 for one in limits} == {own.accel_y_mm_s2}
+    assert blocks[-1].limits[int(blocks[-1].events.limits_id[-1])] == own
+
+
+def with_limits_of_each_axis(kind: str) -> Machine:
+    section = json.loads((EXAMPLES / f"{kind}.json").read_text())
+    for axis, accel_mm_s2 in (("x", 3000.0), ("y", 1000.0)):
+        if kind == "marlin":
+            section["planner"]["max_accel_mm_s2"][axis] = accel_mm_s2
+        else:
+            section[axis]["max_accel_mm_s2"] = accel_mm_s2
+    return with_firmware(load_machine("generic-bedslinger"), section)
+
+
+def test_drives_are_what_the_axes_shown_can_do():
+    machine = with_limits_of_each_axis("reprapfirmware")
+    assert coupon_program(machine, SETTINGS)[1].accel_mm_s2 <= 1000.0
+    top = {axis: tower_program(machine, axis, SETTINGS, 4)[1][-1].accel_mm_s2 for axis in "xy"}
+    assert top["y"] <= 1000.0 < top["x"] <= 3000.0
+    assert RingTest(machine, RingSettings()).accel_mm_s2 == {"x": 3000.0, "y": 1000.0}
 
 
 @pytest.mark.parametrize("name", builtin_machines())

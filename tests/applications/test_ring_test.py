@@ -93,11 +93,12 @@ def test_klipper_logs_every_sensor_once(machine: Machine) -> None:
     ]
 
 
-def test_a_travel_without_room_is_refused(machine: Machine) -> None:
+@pytest.mark.parametrize("reach_mm", [10.0, 30.0])
+def test_a_travel_without_room_is_refused(machine: Machine, reach_mm: float) -> None:
     small = machine.model_copy(
         update={
             "travel": machine.travel
-            | {"x": machine.travel["x"].model_copy(update={"min_mm": 0.0, "max_mm": 30.0})}
+            | {"x": machine.travel["x"].model_copy(update={"min_mm": 0.0, "max_mm": reach_mm})}
         }
     )
     with pytest.raises(ModelError, match=r"moves x by 20 mm at least.*correct the machine"):
