@@ -15,7 +15,9 @@ from stillpath.applications.proof.program import PrintSettings
 from stillpath.applications.proof.readback import verify_log
 from stillpath.applications.proof.tower import tower_program
 from stillpath.models.errors import ModelError
+from stillpath.models.firmware.klipper import FirmwareShaper
 from stillpath.models.machine import Machine
+from stillpath.models.shaping import AxisShaper, Shaping
 from stillpath.models.store import load_machine
 from tests.service.recorded import record
 
@@ -75,6 +77,33 @@ def test_a_mode_that_fell_is_found_and_said(machine, printed, tmp_path):
     assert "<script" not in page
     assert "http" not in re.sub(r"http-equiv", "", page)
     assert json.loads((tmp_path / "report" / "readback.json").read_text())["machine"] == "ender3"
+
+
+@pytest.mark.parametrize(
+    ("told", "type_", "outcome", "said"),
+    [
+        (True, "mzv", "the model holds", "the model holds"),
+        (True, "none", "the model holds", "the model holds"),
+        (False, "mzv", "the shaper is not known", "nothing is said of the machine"),
+        (False, "none", "the model holds", "the model holds"),
+    ],
+)
+def test_the_firmware_s_shaper(told, type_, outcome, said, machine, printed, tmp_path):
+    """In a file as sliced, which leaves the shaper as printer.cfg has it."""
+    sliced, log = tmp_path / "sliced.gcode", tmp_path / "log.csv"
+    lines = printed.read_text().splitlines(keepends=True)
+    sliced.write_text("".join(x for x in lines if not x.startswith("SET_INPUT_SHAPER")))
+    axes = [AxisShaper(type_, machine.axes[a].nominal.modes[1].f_hz) for a in "xy"]
+    record(sliced, machine, log, start_s=280, seconds=40, shaping=Shaping(*axes))
+    stated = None
+    if told:
+        x_hz, y_hz = (axis.f_hz if axis.is_on else 0.0 for axis in axes)
+        stated = FirmwareShaper(freq_x_hz=x_hz, freq_y_hz=y_hz)
+    firmware = machine.firmware.model_copy(update={"shaper": stated})
+    report = verify_log(sliced, log, machine.model_copy(update={"firmware": firmware}))
+    assert report.outcome == outcome
+    assert all(said in verdict for verdict in report.verdicts), report.verdicts
+    assert any("firmware.shaper" in note for note in report.notes) is not told
 
 
 def test_a_log_of_another_print_is_recognised(machine, printed, tmp_path):
