@@ -131,12 +131,15 @@ def test_a_sensor_on_the_head_of_a_bed_slinger_sees_x_only(machine, printed, tmp
     assert any("no motion of Y" in note for note in report.notes)
 
 
-@pytest.mark.slow
-def test_a_wrong_scale_is_not_taken_for_a_change_of_the_machine(machine, printed, tmp_path):
-    record(printed, machine, tmp_path / "log.csv", sees=(0.7, 0.7), start_s=300)
+@pytest.mark.parametrize("scale", [pytest.param(0.70, marks=pytest.mark.slow), 0.01, 1000])
+def test_a_wrong_scale_is_not_taken_for_a_change_of_the_machine(scale, machine, printed, tmp_path):
+    log = tmp_path / "log.csv"
+    noise = {"noise_mm_s2": 60.0 * scale, "step_mm_s2": 37.0 * scale}
+    record(printed, machine, log, sees=(scale, scale), start_s=300, **noise)
     report = verify_log(printed, tmp_path / "log.csv", machine)
     assert modes(report)["x"] == pytest.approx(1.0, abs=0.002)
-    assert all("reads 0.70 of the predicted" in verdict for verdict in report.verdicts)
+    read = [float(re.search(r"reads (\S+) of the predicted", v)[1]) for v in report.verdicts]
+    assert read == pytest.approx([scale, scale], rel=0.02)
 
 
 @pytest.mark.slow
