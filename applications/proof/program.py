@@ -165,7 +165,7 @@ class Program:
         """Restore limits and shaper, switch heaters off, move the nozzle up and aside."""
         machine = self._machine
         self._retract()
-        own = self._stream_commands.limits(self._firmware_adapter.initial_limits())
+        own = self._stream_commands.acceleration_back(self._firmware_adapter.initial_limits())
         self._add(*(own + (self._stream_commands.shaper_on or b"")).decode().splitlines())
         if self._settings.end_gcode is not None:
             self._add(*self._settings.end_gcode.splitlines())

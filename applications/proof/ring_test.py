@@ -125,7 +125,7 @@ class RingTest:
             self._centre()
             self._add(*recorder.after(seconds))
         self._add(*recorder.last())
-        own = self._stream_commands.limits(self._firmware_adapter.initial_limits())
+        own = self._stream_commands.acceleration_back(self._firmware_adapter.initial_limits())
         self._add(*(own + (self._stream_commands.shaper_on or b"")).decode().splitlines())
 
     def _stops(self, half: Literal["off", "on"]) -> float:

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from stillpath.applications.machines.checks import with_firmware
 from stillpath.applications.proof.confirming import verify_ring
 from stillpath.applications.proof.recorders import RingSettings
 from stillpath.applications.proof.ring_figures import RingReport
@@ -24,6 +25,7 @@ from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine
 from tests.service.ringing import SENSOR, TRUE, Chain, machine_of, recorded
 
+EXAMPLES = Path(__file__).parents[2] / "examples" / "firmware"
 TODAY = date(2026, 11, 24)
 
 
@@ -91,6 +93,17 @@ def test_klipper_logs_every_sensor_once(machine: Machine) -> None:
         "ACCELEROMETER_MEASURE CHIP=head NAME=ring",
         "ACCELEROMETER_MEASURE CHIP=bed NAME=ring",
     ]
+
+
+@pytest.mark.parametrize("kind", ["marlin", "reprapfirmware"])
+def test_other_firmwares_have_ring_tests(
+    kind: str, machine: Machine, cache: Path, tmp_path: Path
+) -> None:
+    section = json.loads((EXAMPLES / f"{kind}.json").read_text())
+    made = with_firmware(machine, section)
+    write_ring_test(made, tmp_path / "ring.gcode", cache_dir=cache)
+    motion = read_ring_motion(tmp_path / "ring.gcode", made)
+    assert len(motion.of("y", compensated=True)) == 12
 
 
 @pytest.mark.parametrize("reach_mm", [10.0, 30.0])

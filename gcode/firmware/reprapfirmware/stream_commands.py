@@ -97,6 +97,12 @@ class RepRapStreamCommands:
         accel = _number(accel_mm_s2)
         return f"{_FENCE}\nM204 P{accel} T{accel}\n".encode()
 
+    def acceleration_back(self, limits: Limits) -> bytes:
+        """Return the line that sets the limits' M204."""
+        own = cast(RepRapLimits, limits)
+        accels = _number(own.print_accel_mm_s2), _number(own.travel_accel_mm_s2)
+        return "{}\nM204 P{} T{}\n".format(_FENCE, *accels).encode()
+
     def in_stream(self, limits: Limits) -> Limits:
         """Return the file's own limits."""
         return limits
