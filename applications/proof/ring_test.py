@@ -70,6 +70,7 @@ class RingTest:
         By axis, in the order of the file.
     accel_mm_s2 : dict
         By axis.
+    recorder : Recorder
     """
 
     def __init__(self, machine: Machine, settings: RingSettings) -> None:
@@ -87,6 +88,7 @@ class RingTest:
         self.speeds_mm_s: dict[Axis, tuple[float, ...]] = {
             axis: self._speeds(ringing_mode(machine.axes[axis].nominal), axis) for axis in AXES
         }
+        self.recorder = recorder_for(machine, settings)
         self._rests = _rests()
         self._at_mm: dict[Axis, float] = {}
         self._out: list[str] = []
@@ -108,8 +110,7 @@ class RingTest:
         height_mm = min(max(travel.min_mm, 0.0) + _HEIGHT_MM, self._middle["z"])
         self._add(f"G1 Z{height_mm:.3f} F{60 * self._z_mm_s:.0f}")
         self._centre()
-        recorder = recorder_for(self._machine.firmware, self._settings)
-        self._add(*recorder.first())
+        self._add(*self.recorder.first())
         for number in range(1, ROUNDS + 1):
             begins = len(self._out)
             seconds = 0.0
@@ -121,10 +122,10 @@ class RingTest:
             self._add("; STILLPATH_ON")
             seconds += self._stops("on")
             self._add("; STILLPATH_OFF", ";TYPE:end")
-            self._out[begins:begins] = recorder.before(number, seconds)
+            self._out[begins:begins] = self.recorder.before(number, seconds)
             self._centre()
-            self._add(*recorder.after(seconds))
-        self._add(*recorder.last())
+            self._add(*self.recorder.after(seconds))
+        self._add(*self.recorder.last())
         own = self._stream_commands.acceleration_back(self._firmware_adapter.initial_limits())
         self._add(*(own + (self._stream_commands.shaper_on or b"")).decode().splitlines())
 
@@ -209,7 +210,7 @@ def write_ring_test(
     Raises
     ------
     ModelError
-        The travel is too small, or an axis does not ring.
+        The travel is too small, an axis does not ring, or not all can be compensated.
     DesignError, GcodeError
         As of `pipeline.compensate.compensate_file`.
     """
@@ -217,7 +218,12 @@ def write_ring_test(
     program = RingTest(machine, settings)
 
     def legend(_: dict[str, Ringing], result: Result) -> list[str]:
-        recorder = recorder_for(machine.firmware, settings)
+        if result.put_back:
+            raise ModelError(
+                f"{len(result.put_back)} of the {result.pieces} parts of the ring test that should "
+                f"be compensated would stay as planned ({result.put_back[0].reason}), and its logs "
+                "would say nothing: see what the motors bear (`command` of the machine's document)"
+            )
         stops = [
             f"{' '.join(f'{v:g}' for v in program.speeds_mm_s[a])} mm/s in {a.upper()} at "
             f"{program.accel_mm_s2[a]:g} mm/s2"
@@ -227,7 +233,7 @@ def write_ring_test(
             f"{TITLE}{machine.title} (model {machine.revision})",
             f"Nothing is printed, nothing is heated: the head stops dead from {', '.join(stops)},",
             "half of the times as planned, half compensated. Do not touch machine or table.",
-            *recorder.instruction,
+            *program.recorder.instruction,
             ", ".join(plants_line(a, plants_digest(machine.axes[a])) for a in AXES),
             f"Time {result.time_s:.0f} s without homing.",
         ]
