@@ -443,6 +443,14 @@ def from_m503(
     ]
     if assumed:
         typer.echo(f"assumed, for M503 does not say it: {', '.join(assumed)}; --set says otherwise")
+    section = machine.firmware.model_dump(mode="json", exclude_unset=True)
+    short = [
+        f"{place}={value:g}"
+        for place, value in marlin_settings.rounded(section).items()
+        if place not in said
+    ]
+    if short:
+        typer.echo(f"rounded by M503: {', '.join(short)}; give the exact values with --set")
     for line in _refused(machine):
         typer.echo(line)
 
