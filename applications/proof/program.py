@@ -84,7 +84,7 @@ def place(
     centre = settings.centre_mm or middle
     for axis, t, c, size in zip("xy", travel, centre, (width_mm, depth_mm), strict=True):
         room = min(c - t.min_mm, t.max_mm - c) - _MARGIN_MM
-        if 0.5 * size > room:
+        if not 0.5 * size <= room:  # a centre may be nan
             raise ModelError(
                 f"the {what} is {width_mm:.0f} x {depth_mm:.0f} mm; around {axis} = {c:g} mm the "
                 f"travel of {axis} ({t.min_mm:g} to {t.max_mm:g} mm) leaves {2 * room:.0f} mm with "

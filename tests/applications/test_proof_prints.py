@@ -17,6 +17,7 @@ from stillpath.applications.proof.recorders import RingSettings
 from stillpath.applications.proof.ring_test import RingTest
 from stillpath.applications.proof.tower import tower_program, write_tower
 from stillpath.cli.main import run
+from stillpath.cli.proof import PrintOptions
 from stillpath.gcode.firmware.klipper.planner import Planner
 from stillpath.gcode.firmware.planning import join_phases
 from stillpath.gcode.firmware.registry import adapter
@@ -175,6 +176,8 @@ def test_too_small_a_bed_is_refused_with_the_reason():
         coupon_program(small, SETTINGS)
     with pytest.raises(ModelError, match="around x = 20 mm"):
         coupon_program(machine, PrintSettings(centre_mm=(20.0, 100.0)))
+    with pytest.raises(ModelError, match="around x = nan mm"):
+        coupon_program(machine, PrintSettings(centre_mm=(math.nan, 100.0)))
     with pytest.raises(ModelError, match="nozzle temperature 20 is outside 150 to 350"):
         coupon_program(machine, PrintSettings(nozzle_temp_c=20))
     with pytest.raises(ModelError, match="13 bands"):
@@ -228,6 +231,13 @@ def test_own_lines_at_start_and_end_and_the_shaper_put_back():
     assert default[:5] == ["M140 S60", "M104 S210", "G28", "M190 S60", "M109 S210"]
     assert "M104 S0" in default[-6:]
     assert "M140 S0" in default[-6:]
+
+
+def test_own_lines_may_begin_with_a_byte_order_mark(tmp_path):
+    (tmp_path / "start.gcode").write_text("\ufeffSTART_PRINT\n", encoding="utf-8")
+    assert PrintOptions(start_gcode=tmp_path / "start.gcode").chosen().start_gcode == (
+        "START_PRINT\n"
+    )
 
 
 @pytest.mark.slow
