@@ -45,16 +45,12 @@ _SEEN = 0.3
 _MATCHED = 0.5
 _UNKNOWN_SHAPER = (
     "The machine does not say which shaper the firmware had (firmware.shaper), and up to the part "
-    "that was compared the file sets none: state it in the machine's document"
+    "that was compared the file sets none: state it in the machine's document."
 )
 
 
 def verify_log(
-    printed: Path,
-    log: Path,
-    machine: Machine,
-    *,
-    progress: ProgressCallback | None = None,
+    printed: Path, log: Path, machine: Machine, *, progress: ProgressCallback | None = None
 ) -> ReadbackReport:
     """Compare a log that was recorded during a print with the prediction for it.
 
@@ -95,18 +91,16 @@ def verify_log(
         return _another_print(report, found)
     axes, sensor, notes = _in_machine_axes(command, predicted, measured, found, specs)
     judged = [judge(axis, command.dt_s) for axis in axes]
-    notes = [*recorded.notes, *_notes(found, machine), *notes]
-    outcome = "the model holds" if all(a.holds for a in judged) else "the machine has changed"
+    otherwise = "the machine has changed"
     if found.plan_start_s < known_from_s:
-        notes.append(f"{_UNKNOWN_SHAPER}.")
+        otherwise = "the shaper is not known"
+        notes.append(_UNKNOWN_SHAPER)
         judged = [_shaper_or_machine(axis) for axis in judged]
-        if outcome != "the model holds":
-            outcome = "the shaper is not known"
     return ReadbackReport(
         **report,
-        outcome=outcome,
+        outcome="the model holds" if all(a.holds for a in judged) else otherwise,
         verdicts=[a.verdict for a in judged],
-        notes=notes,
+        notes=[*recorded.notes, *_notes(found, machine), *notes],
         compared_s=len(axes[0].measured) * command.dt_s,
         plan_start_s=found.plan_start_s,
         clock_ppm=1e6 * (found.rate - 1.0),
