@@ -67,7 +67,8 @@ def machines(context: typer.Context) -> None:
 
     store = open_machines().store
     table = _table("name", "machine", "kinematics", "content", "revision", "approved")
-    for machine in map(load_machine, builtin_machines()):
+    library = [name for name in builtin_machines() if name not in store]
+    for machine in map(load_machine, library):
         table.add_row(machine.name, machine.title, machine.kinematics, machine.revision, "built in")
     for name in store.names():
         try:

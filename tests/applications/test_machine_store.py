@@ -30,6 +30,7 @@ from stillpath.applications.machines.revision import (
 from stillpath.applications.machines.settings import user_data_dir
 from stillpath.applications.machines.store import MachineStore
 from stillpath.applications.machines.transfer import export_history, import_file
+from stillpath.cli.main import run
 from stillpath.models.errors import ModelError
 from stillpath.models.store import builtin_machines, load_machine
 from stillpath.service.database.documents import DocumentTable
@@ -393,11 +394,19 @@ def test_a_name_is_found_wherever_it_is(store: MachineStore, tmp_path: Path):
 
 
 def test_a_user_s_machine_is_not_shadowed_by_one_built_in_later(
-    store: MachineStore, monkeypatch: pytest.MonkeyPatch
+    store: MachineStore,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ):
     with monkeypatch.context() as earlier:  # a version whose library had no such machine
         earlier.setattr("stillpath.applications.machines.store.builtin_machines", list)
         store.add_revision("ender3", make_machine("ender3"), author="anna")
+    monkeypatch.setenv("STILLPATH_DATA_DIR", str(tmp_path))
+    assert run(["machines"]) == 0
+    listed = [line for line in capsys.readouterr().out.splitlines() if line.startswith("ender3 ")]
+    assert len(listed) == 1
+    assert "built in" not in listed[0]
     resolver = Resolver(store)
     assert resolver.for_job("ender3").number == 1
     assert resolver.names().count("ender3") == 1
