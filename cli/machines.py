@@ -67,7 +67,8 @@ def machines(context: typer.Context) -> None:
 
     store = open_machines().store
     table = _table("name", "machine", "kinematics", "content", "revision", "approved")
-    for machine in map(load_machine, builtin_machines()):
+    library = [name for name in builtin_machines() if name not in store]
+    for machine in map(load_machine, library):
         table.add_row(machine.name, machine.title, machine.kinematics, machine.revision, "built in")
     for name in store.names():
         try:
@@ -443,6 +444,14 @@ def from_m503(
     ]
     if assumed:
         typer.echo(f"assumed, for M503 does not say it: {', '.join(assumed)}; --set says otherwise")
+    section = machine.firmware.model_dump(mode="json", exclude_unset=True)
+    short = [
+        f"{place}={value:g}"
+        for place, value in marlin_settings.rounded(section).items()
+        if place not in said
+    ]
+    if short:
+        typer.echo(f"rounded by M503: {', '.join(short)}; give the exact values with --set")
     for line in _refused(machine):
         typer.echo(line)
 

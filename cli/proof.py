@@ -256,7 +256,7 @@ def _remember(machines: Resolver, name: str, report: RingReport, author: str, me
 
 
 def _text(file: Path | None) -> str | None:
-    return None if file is None else file.read_text(encoding="utf-8", errors="replace")
+    return None if file is None else file.read_text(encoding="utf-8-sig", errors="replace")
 
 
 def _point(text: str) -> tuple[float, float]:

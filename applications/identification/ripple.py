@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from pydantic import ValidationError
+
 from stillpath.applications.identification.run import read_inputs
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.ripple import RippleLearning, WaveBasis
@@ -12,9 +14,11 @@ from stillpath.models.identification.ripple_passes import learn_machine_ripple, 
 from stillpath.models.machine import Machine
 from stillpath.models.provenance import SourceFile
 from stillpath.models.ripple import RippleAxis, RippleSide
+from stillpath.models.store import explain
 
 __all__ = ["LearntRipple", "learn_from_files", "parse_basis"]
 
+_LONGEST_NAME = 64
 _FORM = "NAME:PITCH, NAME:PITCH:1,2,3 or either with @output appended"
 
 
@@ -27,12 +31,21 @@ class LearntRipple:
     summary: str
 
     def named(self, name: str | None, title: str | None) -> Machine:
-        """Return the machine, with another name and title if given."""
+        """Return the machine, with another name and title if given.
+
+        Raises
+        ------
+        ModelError
+            If no machine can have them.
+        """
         machine = self.machine
         if name is not None and name != machine.name:
             title = title or f"{machine.title}, ripple learnt"
         update = {"name": name or machine.name, "title": title or machine.title}
-        return Machine.model_validate(machine.model_dump() | update)
+        try:
+            return Machine.model_validate(machine.model_dump() | update)
+        except ValidationError as error:
+            raise ModelError(f"machine {update['name']!r:.80}: {explain(error)}") from None
 
 
 def learn_from_files(
@@ -96,11 +109,12 @@ def parse_basis(text: str) -> WaveBasis:
         enters = sides[side]
     except (IndexError, KeyError, ValueError):
         raise ModelError(f"--ripple {text!r}: {_FORM} is needed") from None
-    good = len(fields) <= 3 and name and 1e-3 < pitch_mm <= 2000 and min(numbers) >= 1
+    good = len(fields) <= 3 and 1e-3 < pitch_mm <= 2000 and min(numbers) >= 1
+    good = good and 1 <= len(name) <= _LONGEST_NAME
     if not good or max(numbers) > 400 or len(set(numbers)) < len(numbers):
         raise ModelError(
-            f"--ripple {text!r}: {_FORM} is needed, the pitch above 0.001 and up to 2000 mm, the "
-            "harmonics from 1 to 400 and each once"
+            f"--ripple {text!r}: {_FORM} is needed, the name up to {_LONGEST_NAME} characters, "
+            "the pitch above 0.001 and up to 2000 mm, the harmonics from 1 to 400 and each once"
         )
     return WaveBasis(name, pitch_mm, numbers, enters)
 

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -112,7 +113,12 @@ class DocumentFolder:
         file = self._root / path
         if beside is None:
             file.parent.mkdir(parents=True, exist_ok=True)
-        publish(file, text)
+        try:
+            publish(file, text)
+        except OSError:
+            with contextlib.suppress(OSError):
+                file.parent.rmdir()  # only if it is empty
+            raise
         if beside is not None and not (self._root / beside).exists():
             # The folder was moved and recreated meanwhile, and this does not belong in the new one.
             file.unlink(missing_ok=True)

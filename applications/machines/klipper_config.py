@@ -86,6 +86,16 @@ class PrinterConfig:
             )
         return value
 
+    def positive(self, section: str, option: str) -> float:
+        """Return a number that must be there and above 0."""
+        value = self.number(section, option)
+        if value <= 0.0:
+            line = self.sections[section][option].line
+            raise ModelError(
+                f"{self.name} line {line}: [{section}] {option}: {value:g} must be above 0"
+            )
+        return value
+
     def _elsewhere(self) -> str:
         if not self.includes:
             return "; is it a printer.cfg?"
@@ -187,7 +197,9 @@ def _printer(config: PrinterConfig) -> list[Fact]:
     ratio, option = 0.5, "minimum_cruise_ratio"
     if config.text(section, option) is None and config.text(section, "max_accel_to_decel"):
         option = "max_accel_to_decel"
-        ratio = 1.0 - min(1.0, config.number(section, option) / accel)
+        ratio = 1.0 - min(
+            1.0, config.number(section, option) / config.positive(section, "max_accel")
+        )
     else:
         ratio = config.number(section, option, ratio)
     planner = "firmware.planner"
@@ -225,7 +237,7 @@ def _extruder(config: PrinterConfig) -> list[Fact]:
     if section not in config.sections:
         return []
     nozzle = config.number(section, "nozzle_diameter")
-    filament = config.number(section, "filament_diameter")
+    filament = config.positive(section, "filament_diameter")
     # Klipper: extrude-only moves may push as much as the widest line at the top speed.
     ratio = 4.0 * nozzle**2 / (math.pi * (0.5 * filament) ** 2)
     shared: list[Fact] = []

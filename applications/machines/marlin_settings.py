@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Sequence
 from typing import Any
@@ -25,6 +26,7 @@ __all__ = [
     "looks_like_m503",
     "machine_from_m503",
     "read_travel",
+    "rounded",
     "with_m503",
 ]
 
@@ -39,6 +41,14 @@ ASSUMED = {
 
 _COMMAND = re.compile(r"(M\d{2,3})((?:\s+[A-Z](?:-?\d+(?:\.\d*)?)?)+)\s*(?:;.*)?$")
 _WORD = re.compile(r"([A-Z])(-?\d+(?:\.\d*)?)?")
+_ROUNDED = (
+    "planner.junction_deviation_mm",
+    "linear_advance_k_s",
+    "shaper.damping_x",
+    "shaper.damping_y",
+)
+_ROUNDING = 0.00501
+"""Marlin prints two decimals of everything, which is little of these."""
 _PER_TOOL = {"M92", "M201", "M203", "M900"}
 _LONGEST_LINE = 500
 
@@ -175,6 +185,8 @@ def machine_from_m503(
 def with_m503(machine: Machine, text: str, file: str) -> Machine:
     """Return a machine with the limits of a printed M503; those it lacks remain.
 
+    So do exact values that M503 prints rounded (`rounded`).
+
     A machine of another firmware becomes one with Marlin, with what most builds have (`ASSUMED`)
     where M503 says nothing.
 
@@ -187,12 +199,34 @@ def with_m503(machine: Machine, text: str, file: str) -> Machine:
     before: dict[str, Any] = dict(ASSUMED)
     if machine.firmware.kind == "marlin":
         before = machine.firmware.model_dump(mode="json", exclude_unset=True)
+        _unrounded(said, before)
     for part in ("planner", "shaper"):
         said[part] = {**(before.get(part) or {}), **said[part]}
     try:
         return with_firmware(machine, {**before, **said})
     except ValidationError as error:
         raise ModelError(f"{file}: {explain(error)}") from None
+
+
+def rounded(section: dict[str, Any]) -> dict[str, float]:
+    """Return what M503 has printed with too few decimals of a section, by the field's place."""
+    found = {}
+    for place in _ROUNDED:
+        part, _, field = place.rpartition(".")
+        value = (section.get(part) or {} if part else section).get(field)
+        if value:
+            found[place] = value
+    return found
+
+
+def _unrounded(said: dict[str, Any], before: dict[str, Any]) -> None:
+    """Keep earlier values that M503 would print as it did."""
+    exact = rounded(before)
+    for place in _ROUNDED:
+        part, _, field = place.rpartition(".")
+        inner = said[part] if part else said
+        if field in inner and abs(exact.get(place, math.inf) - inner[field]) <= _ROUNDING:
+            inner[field] = exact[place]
 
 
 def read_travel(text: str) -> tuple[float, float, float]:

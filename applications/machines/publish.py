@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import tempfile
 import time
@@ -13,6 +14,8 @@ from stillpath.pipeline.files import sync
 __all__ = ["publish", "sync_folder"]
 
 _ABANDONED_S = 3600.0
+_NO_LINKS = {errno.EPERM, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP}
+"""What FAT, SMB and Android answer to a link."""
 
 
 def publish(target: Path, text: str) -> None:
@@ -51,8 +54,17 @@ def sync_folder(folder: Path) -> None:
 def _take_name(temporary: Path, target: Path) -> None:
     if os.name == "nt":
         temporary.rename(target)  # refuses to replace, unlike elsewhere
-    else:
+        return
+    try:
         target.hardlink_to(temporary)
+    except OSError as error:
+        if error.errno not in _NO_LINKS:
+            raise
+        raise OSError(
+            error.errno,
+            "this file system has no hard links: put STILLPATH_DATA_DIR on a local disk",
+            str(target),
+        ) from None
 
 
 def _sweep(folder: Path) -> None:

@@ -69,7 +69,9 @@ class PinnedMachine(Document):
 
 
 class Resolver:
-    """Finds machines by name. Names of built-in machines are reserved, so names are unique.
+    """Finds machines by name.
+
+    Names of built-in machines are reserved. One that a later version has built in stays the user's.
 
     Parameters
     ----------
@@ -114,12 +116,14 @@ class Resolver:
 
     def names(self) -> list[str]:
         """Return all names: built-in machines first, then the user's."""
-        return [*builtin_machines(), *self.store.names()]
+        return list(dict.fromkeys([*builtin_machines(), *self.store.names()]))
 
     def _find(self, name: str, *, files: bool, approved: bool) -> PinnedMachine:
-        if name in builtin_machines() or (files and names_a_file(name)):
+        if files and names_a_file(name):
             return PinnedMachine(machine=load_machine(name))
         if name not in self.store:
+            if name in builtin_machines():
+                return PinnedMachine(machine=load_machine(name))
             raise UnknownMachine(str(no_such_machine(name, self.store.names(), files=files)))
         revision = self.store.usable(name, require_approval=approved)
         return PinnedMachine(machine=revision.machine, number=revision.number)

@@ -297,6 +297,11 @@ class _Axis:
             f"{um_text(high)}; "
             f"{um_text(planned.measured_um)} µm as planned"
         )
+        if compensated.predicted_um[0] > planned.predicted_um[0] / _LEAST_GAIN:
+            return "says nothing", (
+                f"{said}: the stops that should be compensated are not, so that no plant of the "
+                "set predicts half of that as planned; write a new ring test"
+            )
         if off.rms < _ABOVE_FLOOR * noise_um:
             return "says nothing", (
                 f"{said}: the noise of the log is {um_text(noise_um)} µm, too much for this "

@@ -38,9 +38,8 @@ def coupon_program(machine: Machine, settings: PrintSettings) -> tuple[Program, 
     """
     halves = Halves(machine, settings, _SIDE_MM, _SIDE_MM, "coupon")
     program = halves.program
-    modes = [ringing_mode(machine.axes[a].nominal) for a in ("x", "y")]
     flow_mm_s = settings.max_flow_mm3_s / program.section_mm2
-    chosen = drive(machine, modes, flow_mm_s, _SIDE_MM)
+    chosen = drive(machine, flow_mm_s, _SIDE_MM)
     z = halves.begin()
     program.limit_accel(chosen.accel_mm_s2)
     layers = round(_HEIGHT_MM / program.layer_mm)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal, TypeAlias
 
 import numpy as np
 
@@ -12,7 +13,10 @@ from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
 from stillpath.models.plants import PlantSpec, continuous
 
-__all__ = ["Drive", "RingingMode", "bands", "drive", "ringing_mode"]
+__all__ = ["AXES", "Axis", "Drive", "RingingMode", "bands", "drive", "ringing_mode"]
+
+Axis: TypeAlias = Literal["x", "y"]
+AXES: tuple[Axis, Axis] = ("x", "y")
 
 _WAVE_MM = (2.0, 6.0)
 """Ripples of this length show best on a wall."""
@@ -93,21 +97,20 @@ def ringing_mode(spec: PlantSpec) -> RingingMode:
     return RingingMode(complex(poles[rings][best]), float(amplitude[best]))
 
 
-def drive(machine: Machine, modes: Sequence[RingingMode], flow_mm_s: float, run_mm: float) -> Drive:
-    """Choose speed and acceleration so that all modes ring visibly.
+def drive(machine: Machine, flow_mm_s: float, run_mm: float) -> Drive:
+    """Choose speed and acceleration, of X and Y alike, so that both ring visibly.
 
     Parameters
     ----------
-    modes : sequence of RingingMode
-        One per axis.
     flow_mm_s : float
         Fastest speed of the hotend.
     run_mm : float
         Length within which to accelerate and brake.
     """
     best: tuple[tuple[float, ...], Drive] | None = None
-    for accel in _accelerations(machine, modes):
-        fastest = _fastest(machine, flow_mm_s, run_mm, accel)
+    modes = [ringing_mode(machine.axes[axis].nominal) for axis in AXES]
+    for accel in _accelerations(machine, AXES, modes):
+        fastest = _fastest(machine, AXES, flow_mm_s, run_mm, accel)
         for speed in np.arange(_LOWEST_MM_S, fastest + 1e-6, 2.5):
             rings = [mode.ringing_um(speed, accel) for mode in modes]
             least = min(min(rings), _LARGEST_UM)
@@ -124,14 +127,15 @@ def drive(machine: Machine, modes: Sequence[RingingMode], flow_mm_s: float, run_
     return best[1]
 
 
-def bands(
-    machine: Machine, mode: RingingMode, flow_mm_s: float, run_mm: float, count: int
-) -> list[Drive]:
+def bands(machine: Machine, axis: Axis, flow_mm_s: float, run_mm: float, count: int) -> list[Drive]:
     """Return speeds and accelerations that rise from band to band, each with maximal ringing."""
-    top = _accelerations(machine, [mode])[-1]
+    mode = ringing_mode(machine.axes[axis].nominal)
+    top = _accelerations(machine, (axis,), [mode])[-1]
     accels = _rounded(np.geomspace(max(top / count, min(_LOWEST_MM_S2, top)), top, count))
-    fastest = _fastest(machine, flow_mm_s, run_mm, accels[0])
-    edges = np.linspace(0.5 * fastest, _fastest(machine, flow_mm_s, run_mm, top), count + 1)
+    slowest, fastest = (
+        _fastest(machine, (axis,), flow_mm_s, run_mm, accel) for accel in (accels[0], top)
+    )
+    edges = np.linspace(0.5 * slowest, fastest, count + 1)
     out = []
     for accel, low, high in zip(accels, edges[:-1], edges[1:], strict=True):
         # A speed within the band's range at which the acceleration steps do not cancel.
@@ -142,9 +146,11 @@ def bands(
     return out
 
 
-def _accelerations(machine: Machine, modes: Sequence[RingingMode]) -> list[float]:
-    """Return rising accelerations up to the machine's own, or up to the largest useful ringing."""
-    largest = machine.firmware.largest_accel_mm_s2
+def _accelerations(
+    machine: Machine, axes: tuple[Axis, ...], modes: Sequence[RingingMode]
+) -> list[float]:
+    """Return rising accelerations up to the axes' own, or up to the largest useful ringing."""
+    largest = min(machine.firmware.allowance(axis).accel_mm_s2 for axis in axes)
     useful = min(_LARGEST_UM / mode.um_per_mm_s2 for mode in modes)
     top = min(largest, max(useful, _LOWEST_MM_S2))
     return _rounded(np.linspace(0.4 * top, top, 13))
@@ -155,8 +161,10 @@ def _rounded(accels: np.ndarray) -> list[float]:
     return [float(a) if a < step else float(step * math.floor(a / step + 1e-9)) for a in accels]
 
 
-def _fastest(machine: Machine, flow_mm_s: float, run_mm: float, accel: float) -> float:
-    machine_mm_s = machine.firmware.fastest_mm_s
+def _fastest(
+    machine: Machine, axes: tuple[Axis, ...], flow_mm_s: float, run_mm: float, accel: float
+) -> float:
+    machine_mm_s = min(machine.firmware.allowance(axis).speed_mm_s for axis in axes)
     within = math.sqrt(0.8 * run_mm * accel)
     fastest = min(flow_mm_s, machine_mm_s, within)
     if fastest < _LOWEST_MM_S:

@@ -52,7 +52,10 @@ class AxisReadback(Document):
 
 
 class ReadbackReport(Document):
-    """What `stillpath verify` found. `outcome`: the model holds, has changed, or another print."""
+    """What `stillpath verify` found.
+
+    `outcome`: the model holds, the machine has changed, the shaper is not known, or another print.
+    """
 
     version: str
     machine: str

@@ -27,6 +27,7 @@ __all__ = ["AxisMotion", "judge"]
 Spectrum = NDArray[np.complex128]
 
 _BAND_HZ = (5.0, 200.0)
+_BELOW_MODES_HZ = 20.0
 _SMOOTH_HZ = 2.0
 _EXCERPT_S = 0.4
 _CORNER_S = (0.02, 0.12)
@@ -136,8 +137,12 @@ def _fit(
         return np.asarray(shift * own * frequency_response(plant, f) * command)  # type: ignore[arg-type]
 
     sd = np.full(len(f), np.sqrt(_power(measured) / len(f)))
-    x = np.zeros(5)
-    limits = ([-0.5, -1.5, -1.0, -6.0, -0.2], [0.5, 1.5, 1.0, 6.0, 0.2])
+    # The log's scale is that of the motion below the modes: its unit may be another.
+    low, x = f < _BELOW_MODES_HZ, np.zeros(5)
+    made, felt = model(x)[low], measured[low]
+    x[2] = np.log(max(np.real(np.vdot(made, felt)), 1e-9 * _power(made)) / _power(made))
+    most = np.array([0.5, 1.5, 1.0, 6.0, 0.2])
+    limits = (x - most, x + most)
     width = max(3, round(_SMOOTH_HZ / (f[1] - f[0])))
     for _ in range(3):
 
@@ -179,8 +184,9 @@ def _verdict(axis: str, mode: RingingMode, fit: _Fit, missing: float) -> tuple[s
         )
     elif abs(fit.gain - 1.0) > _GAIN_TOLERANCE:
         text = (
-            f"{axis}: the sensor reads {fit.gain:.2f} of the predicted acceleration ({hz}): check "
-            "its scale and that it is fixed to the moving part."
+            f"{axis}: the sensor reads {fit.gain:{'.2f' if fit.gain > 0.1 else '.2g'}} of the "
+            f"predicted acceleration ({hz}): check its scale (the log is in mm/s2) and that it is "
+            "fixed to the moving part."
         )
     elif missing > _POOR_NRMSE:
         text = (

@@ -19,7 +19,7 @@ from stillpath.models.machine import CommandLimits, Machine
 
 __all__ = ["Level", "borne", "envelope", "levels_of", "motor_test"]
 
-_RISE, _MOST_LEVELS = 1.25, 12
+_RISE, _MOST_LEVELS = 1.25, 16
 _STROKES, _CORNERS = 8, 60
 _LONGEST_MM, _SHARE = 120.0, 0.6
 _LEG_MM, _TURN_RAD = 2.0, math.radians(30.0)
@@ -33,7 +33,12 @@ _DIRECTIONS = (
     (math.sqrt(0.5), -math.sqrt(0.5)),
 )
 _LEVEL = re.compile(r"^; level (\d+): accel ([\d.]+) mm/s2, step ([\d.]+) mm/s$", re.MULTILINE)
-_ANSWER = re.compile(r"mcu: (stepper_.*)")
+_START = "Starting SD card print (position 0)"
+"""In klippy.log at the start of a file; where it is resumed, the position is another."""
+_OVER = "the search is over"
+_TOLD = r"level \d+: accel [\d.]+ mm/s2, step [\d.]+ mm/s"
+_ENTRY = re.compile(rf"mcu: stepper_.*|(?<!M118 )(?<!; )(?:{_TOLD}|{_OVER})")
+"""Answers to GET_POSITION and what M118 says, but not the file's own lines."""
 _COUNTED = re.compile(r"stepper_([xy]\d*):(-?\d+)")
 """A stepper and its counter; an axis may have several."""
 
@@ -72,8 +77,7 @@ def motor_test(machine: Machine, most_accel_mm_s2: float) -> str:
     # A shaper would reduce the load of a stream on the motors.
     lines += stream_commands.shaper_off.decode().splitlines()
     for number, level in enumerate(levels, 1):
-        accel, step = level.accel_mm_s2, level.speed_step_mm_s
-        text = f"level {number}: accel {accel:.0f} mm/s2, step {step:.1f} mm/s"
+        text = _told(number, level)
         lines += [
             f"; {text}",
             f"M118 {text}",
@@ -88,7 +92,7 @@ def motor_test(machine: Machine, most_accel_mm_s2: float) -> str:
         lines += [stream_commands.limits(_own(firmware)).decode().strip(), *home]
     shaper = stream_commands.shaper_on
     over = "; the shaper stays off until FIRMWARE_RESTART" if shaper is None else shaper.decode()
-    return "\n".join([*lines, *over.splitlines(), "M118 the search is over", ""])
+    return "\n".join([*lines, *over.splitlines(), f"M118 {_OVER}", ""])
 
 
 def levels_of(text: str) -> list[Level]:
@@ -105,22 +109,23 @@ def borne(levels: list[Level], console: str, full_step: int) -> int:
     Parameters
     ----------
     console : str
-        The console's text or klippy.log; its last answers to GET_POSITION count.
+        The console's text or klippy.log; of several runs in it the last counts.
     full_step : int
         Microsteps of a full step, of X and Y.
 
     Raises
     ------
     ModelError
-        The text holds fewer answers than the search asks for, or answers of several printers.
+        The text is not that of one whole run of this search on one printer.
     """
-    counts = [dict(_COUNTED.findall(answer)) for answer in _ANSWER.findall(console)]
-    if len(counts) <= len(levels):
+    counts = [dict(_COUNTED.findall(answer)) for answer in _answers(levels, console)]
+    if len(counts) != len(levels) + 1:
         raise ModelError(
             f"the console holds {len(counts)} answers to GET_POSITION, the search asks for "
-            f"{len(levels) + 1}: run the whole file, then hand in the console's text or klippy.log"
+            f"{len(levels) + 1}: run the whole file, then hand in the console's text of this run "
+            "alone, or klippy.log"
         )
-    first, *later = counts[-len(levels) - 1 :]
+    first, *later = counts
     for passed, one in enumerate(later):
         if one.keys() != first.keys():
             raise ModelError(
@@ -145,14 +150,48 @@ def envelope(machine: Machine, level: Level, margin: float) -> CommandLimits:
     return machine.command.model_copy(update=changed)
 
 
+def _told(number: int, level: Level) -> str:
+    accel, step = level.accel_mm_s2, level.speed_step_mm_s
+    return f"level {number}: accel {accel:.0f} mm/s2, step {step:.1f} mm/s"
+
+
+def _answers(levels: list[Level], console: str) -> list[str]:
+    """Return the answers of the last run, which begins with one before the first level."""
+    runs: list[list[str]] = [_ENTRY.findall(run) for run in console.split(_START)]
+    entries = next((run for run in reversed(runs) if run), [])
+    begins = [k for k, entry in enumerate(entries) if entry.startswith("level 1:")]
+    if begins:  # klippy.log has no lines of M118, nor has a printer without [respond]
+        entries = entries[max(begins[-1] - 1, 0) :]
+        if _OVER not in entries:
+            raise ModelError(
+                f"the console's last search has no end (no {_OVER!r}): run the whole file, then "
+                "hand in the console's text, oldest line first"
+            )
+        entries = entries[: entries.index(_OVER)]
+    said = [entry for entry in entries if entry.startswith("level")]
+    if said and said != [_told(number, level) for number, level in enumerate(levels, 1)]:
+        raise ModelError(
+            f"the console's search has other levels ({said[-1]!r} is its last) than the file: hand "
+            "in the text of a run of this file"
+        )
+    return [entry for entry in entries if entry.startswith("mcu")]
+
+
 def _levels(firmware: Klipper, most_accel_mm_s2: float) -> list[Level]:
     own = firmware.largest_accel_mm_s2
+    largest = own * _RISE ** (_MOST_LEVELS - 1)
+    if not most_accel_mm_s2 <= largest:
+        raise ModelError(
+            f"an acceleration of {most_accel_mm_s2:g} mm/s2 is beyond {_MOST_LEVELS} levels from "
+            f"the printer's {own:g} mm/s2 on: search up to {largest:.0f} at most, then raise "
+            "max_accel and search on"
+        )
     if most_accel_mm_s2 <= own:
         raise ModelError(
             f"the printer allows a file {own:g} mm/s2 already: search up to more than that"
         )
     step = _SMALL_CORNER * max(firmware.corner_mm_s, 5.0)
-    count = min(math.ceil(math.log(most_accel_mm_s2 / own) / math.log(_RISE)), _MOST_LEVELS - 1)
+    count = math.ceil(math.log(most_accel_mm_s2 / own) / math.log(_RISE) - 1e-9)
     rise = (most_accel_mm_s2 / own) ** (1.0 / count)
     return [Level(round(own * rise**k), round(step * rise**k, 1)) for k in range(count + 1)]
 

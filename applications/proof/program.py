@@ -84,7 +84,7 @@ def place(
     centre = settings.centre_mm or middle
     for axis, t, c, size in zip("xy", travel, centre, (width_mm, depth_mm), strict=True):
         room = min(c - t.min_mm, t.max_mm - c) - _MARGIN_MM
-        if 0.5 * size > room:
+        if not 0.5 * size <= room:  # a centre may be nan
             raise ModelError(
                 f"the {what} is {width_mm:.0f} x {depth_mm:.0f} mm; around {axis} = {c:g} mm the "
                 f"travel of {axis} ({t.min_mm:g} to {t.max_mm:g} mm) leaves {2 * room:.0f} mm with "
@@ -109,7 +109,8 @@ class Program:
     """
 
     def __init__(self, machine: Machine, settings: PrintSettings) -> None:
-        self._stream_commands = adapter(machine).stream_commands()
+        self._firmware_adapter = adapter(machine)
+        self._stream_commands = self._firmware_adapter.stream_commands()
         extruder = machine.firmware.hotend
         self._machine, self._settings = machine, settings
         self.width_mm = 1.125 * extruder.nozzle_diameter_mm
@@ -164,8 +165,8 @@ class Program:
         """Restore limits and shaper, switch heaters off, move the nozzle up and aside."""
         machine = self._machine
         self._retract()
-        self.limit_accel(machine.firmware.largest_accel_mm_s2)
-        self._add(*(self._stream_commands.shaper_on or b"").decode().splitlines())
+        own = self._stream_commands.acceleration_back(self._firmware_adapter.initial_limits())
+        self._add(*(own + (self._stream_commands.shaper_on or b"")).decode().splitlines())
         if self._settings.end_gcode is not None:
             self._add(*self._settings.end_gcode.splitlines())
             return

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import tempfile
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from stillpath.applications.proof.figures import ReadbackReport
+from stillpath.applications.proof.figures import AxisReadback, ReadbackReport
 from stillpath.applications.proof.judging import AxisMotion, judge
 from stillpath.applications.proof.matching import (
     Match,
@@ -18,11 +19,17 @@ from stillpath.applications.proof.matching import (
     match,
     read_log,
 )
+from stillpath.gcode.containers.opening import open_text
+from stillpath.gcode.firmware.registry import adapter
 from stillpath.models.arrays import Array
 from stillpath.models.machine import Machine
 from stillpath.models.plants import PlantSpec, discretise
-from stillpath.pipeline.progress import ProgressCallback
-from stillpath.pipeline.simulate import plan_file
+from stillpath.models.schedule import EMPTY
+from stillpath.models.shaping import OFF
+from stillpath.pipeline.file_motion import TextMotion
+from stillpath.pipeline.progress import ProgressCallback, ProgressReports
+from stillpath.pipeline.reading import dialect_for
+from stillpath.pipeline.shaping import ShapedMotion
 from stillpath.simulation.response import PlantStream
 from stillpath.version import __version__
 
@@ -36,14 +43,14 @@ _MOUNT_BAND_HZ = (3.0, 20.0)
 _SEEN = 0.3
 """Least response of the sensor to an axis, relative to the other, to count as logged."""
 _MATCHED = 0.5
+_UNKNOWN_SHAPER = (
+    "The machine does not say which shaper the firmware had (firmware.shaper), and up to the part "
+    "that was compared the file sets none: state it in the machine's document."
+)
 
 
 def verify_log(
-    printed: Path,
-    log: Path,
-    machine: Machine,
-    *,
-    progress: ProgressCallback | None = None,
+    printed: Path, log: Path, machine: Machine, *, progress: ProgressCallback | None = None
 ) -> ReadbackReport:
     """Compare a log that was recorded during a print with the prediction for it.
 
@@ -65,7 +72,7 @@ def verify_log(
     """
     recorded = read_log(log, _RECORD)
     measured = log_signal(recorded)
-    command = _planned(printed, machine, progress)
+    command, known_from_s = _commanded(printed, machine, progress)
     specs = {a: machine.axes[a].nominal for a in ("x", "y")}
     answer = PlantStream([discretise(s, command.dt_s) for s in specs.values()]).push(command.rows)
     predicted = Signal(0.0, command.dt_s, _acceleration(answer, command.dt_s))
@@ -84,9 +91,14 @@ def verify_log(
         return _another_print(report, found)
     axes, sensor, notes = _in_machine_axes(command, predicted, measured, found, specs)
     judged = [judge(axis, command.dt_s) for axis in axes]
+    otherwise = "the machine has changed"
+    if found.plan_start_s < known_from_s:
+        otherwise = "the shaper is not known"
+        notes.append(_UNKNOWN_SHAPER)
+        judged = [_shaper_or_machine(axis) for axis in judged]
     return ReadbackReport(
         **report,
-        outcome="the model holds" if all(a.holds for a in judged) else "the machine has changed",
+        outcome="the model holds" if all(a.holds for a in judged) else otherwise,
         verdicts=[a.verdict for a in judged],
         notes=[*recorded.notes, *_notes(found, machine), *notes],
         compared_s=len(axes[0].measured) * command.dt_s,
@@ -95,6 +107,17 @@ def verify_log(
         sensor=[[float(v) for v in column] for column in sensor.T],
         axes=judged,
     )
+
+
+def _shaper_or_machine(axis: AxisReadback) -> AxisReadback:
+    """Return an axis without a verdict on the machine where the shaper may be what differs."""
+    if axis.holds:
+        return axis
+    text = (
+        f"{axis.axis.upper()}: this log does not fit the model without the firmware's shaper, and "
+        "which one was on is not known: nothing is said of the machine."
+    )
+    return axis.model_copy(update={"verdict": text})
 
 
 def _another_print(report: dict[str, Any], found: Match) -> ReadbackReport:
@@ -115,19 +138,43 @@ def _another_print(report: dict[str, Any], found: Match) -> ReadbackReport:
     )
 
 
-def _planned(printed: Path, machine: Machine, progress: ProgressCallback | None) -> Signal:
-    """Commanded positions of X and Y, without the jumps of homing and macros."""
-    with tempfile.TemporaryDirectory(prefix="stillpath-verify-") as folder:
-        target = Path(folder, "motion.npz")
-        plan_file(printed, target, machine, rate_hz=_RATE_HZ, progress=progress)
-        with np.load(target) as motion:
-            rows = np.stack([motion["x"], motion["y"]])
+def _commanded(
+    printed: Path, machine: Machine, progress: ProgressCallback | None
+) -> tuple[Signal, float]:
+    """Return what the motors are sent in X and Y, after the firmware's shaper.
+
+    It is without the jumps of homing and macros. The second value is the time from which on the
+    shaper is known.
+    """
+    dialect = dialect_for(machine, None)
+    stated = adapter(machine).adviser(dialect).stated
+    before = (stated or OFF).modelled
+    known = stated is not None and not stated.unknown_types
+    known_from_s = 0.0
     by_axis = [machine.command.of(axis).velocity_mm_s for axis in ("x", "y")]
     fastest = max(*by_axis, machine.firmware.fastest_mm_s)
-    step = np.diff(rows)
-    step[np.abs(step) > 2.0 * fastest / _RATE_HZ] = 0.0
-    rows[:, 1:] = rows[:, :1] + np.cumsum(step, axis=1)
-    return Signal(0.0, 1.0 / _RATE_HZ, rows)
+    shaper, rows = ShapedMotion(1.0 / _RATE_HZ), []
+    last: Array | None = None
+    place = np.zeros((2, 1))
+    with open_text(printed) as container:
+        say = partial(ProgressReports(progress).say, "planning")
+        motion = TextMotion(
+            container.text, machine, dialect, 1.0 / _RATE_HZ, shaping=before, progress=say
+        )
+        for part in motion:
+            samples = part.motion()
+            before_mm = samples.executed_mm[:, :1] if last is None else last
+            step = np.diff(samples.executed_mm, axis=1, prepend=before_mm)
+            last = samples.executed_mm[:, -1:]
+            step[np.abs(step) > 2.0 * fastest / _RATE_HZ] = 0.0
+            samples = replace(samples, executed_mm=place + np.cumsum(step, axis=1))
+            place = samples.executed_mm[:, -1:]
+            rows += [r.executed_mm for r, _ in shaper.push(samples, part.shaping, EMPTY)]
+            # A line that sets the shaper makes another object, even of the same values.
+            if not known and part.shaping is before:
+                known_from_s = float(part.samples.t_s[-1])
+    rows += [r.executed_mm for r, _ in shaper.flush()]
+    return Signal(0.0, 1.0 / _RATE_HZ, np.concatenate(rows, axis=1)), known_from_s
 
 
 def _acceleration(position: Array, dt_s: float) -> Array:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from dataclasses import dataclass
 
-from stillpath.models.firmware import Firmware
+from stillpath.models.machine import Machine
 
 __all__ = ["Recorder", "RingSettings", "recorder_for"]
 
@@ -34,17 +35,27 @@ class RingSettings:
 
 
 class Recorder:
-    """Lines around a ring test; the base class, for firmware without a sensor, has none."""
+    """Lines around a ring test; the base class, for firmware without a sensor, has none.
 
-    instruction: tuple[str, ...] = (
-        "This firmware logs no accelerations: fix a sensor with a logger of its own to the part",
-        "that moves, at 1000 samples per second or more, and let it log from before the file until",
-        "after it, as `#time,accel_x,accel_y,accel_z` in s and mm/s2.",
-    )
-    """Instructions to the user for the first lines of the file."""
+    Parameters
+    ----------
+    name : str
+        Begins the names of the logs, or ends them. It is the test's own, so that logs of another
+        one are not taken for this one's.
+    """
 
-    def __init__(self, settings: RingSettings) -> None:
+    def __init__(self, settings: RingSettings, name: str) -> None:
+        self._name = name
         self._chips = (settings.chip_x, settings.chip_y or settings.chip_x)
+
+    @property
+    def instruction(self) -> tuple[str, ...]:
+        """Instructions to the user for the first lines of the file."""
+        return (
+            "This firmware logs no accelerations: fix a sensor with a logger of its own to the",
+            "part that moves, at 1000 samples per second or more, and let it log from before the",
+            "file until after it, as `#time,accel_x,accel_y,accel_z` in s and mm/s2.",
+        )
 
     def first(self) -> tuple[str, ...]:
         """Lines before the first round, at rest."""
@@ -63,19 +74,27 @@ class Recorder:
         return ()
 
 
-def recorder_for(firmware: Firmware, settings: RingSettings) -> Recorder:
-    """Return the recorder of a firmware."""
+def recorder_for(machine: Machine, settings: RingSettings) -> Recorder:
+    """Return the recorder of a machine's firmware."""
     kinds: dict[str, type[Recorder]] = {"klipper": _Klipper, "reprapfirmware": _RepRap}
-    return kinds.get(firmware.kind, Recorder)(settings)
+    plain = machine.model_copy(update={"confirmations": {}})
+    digest = hashlib.sha256(f"{plain.revision} {settings}".encode()).hexdigest()[:6]
+    return kinds.get(machine.firmware.kind, Recorder)(settings, f"ring-{digest}")
 
 
 class _Klipper(Recorder):
     """One log of every sensor over the whole file."""
 
-    instruction = (
-        "Klipper writes the log, or one per sensor, to /tmp/*-ring.csv. Give what was logged to",
-        "`stillpath verify THIS-FILE LOG...`.",
-    )
+    @property
+    def instruction(self) -> tuple[str, ...]:
+        """Say where the logs are, and how to end one that a cancelled test has begun."""
+        words = " and ".join(f"`{line}`" for line in self.first())
+        return (
+            f"Klipper writes the log, or one per sensor, to /tmp/*-{self._name}.csv. Give what was",
+            "logged to `stillpath verify THIS-FILE LOG...`. A test that was cancelled leaves its",
+            f"log running, and the next one would end it: send {words}",
+            "once before, and again unless the console says that a file is written.",
+        )
 
     def first(self) -> tuple[str, ...]:
         """Start every sensor."""
@@ -83,7 +102,7 @@ class _Klipper(Recorder):
 
     def last(self) -> tuple[str, ...]:
         """Stop every sensor; each writes its file."""
-        return self._each(" NAME=ring")
+        return self._each(f" NAME={self._name}")
 
     def _each(self, more: str) -> tuple[str, ...]:
         chips = dict.fromkeys(self._chips)
@@ -95,15 +114,20 @@ class _Klipper(Recorder):
 class _RepRap(Recorder):
     """One log per round, as the number of samples is limited."""
 
-    instruction = (
-        "The logs are ring-1*.csv and ring-2*.csv in 0:/sys/accelerometer. Give all of them to",
-        "`stillpath verify THIS-FILE LOG...`.",
-    )
+    @property
+    def instruction(self) -> tuple[str, ...]:
+        """Say where the logs are."""
+        return (
+            f"The logs are {self._name}-*.csv in 0:/sys/accelerometer. Give all of them to",
+            "`stillpath verify THIS-FILE LOG...`.",
+        )
 
     def before(self, number: int, seconds: float) -> tuple[str, ...]:
         """Stand still and start."""
         chips = list(dict.fromkeys(chip or "0" for chip in self._chips))
-        names = [f"ring-{number}" + (f"-{chip}" if len(chips) > 1 else "") for chip in chips]
+        names = [
+            f"{self._name}-{number}" + (f"-{chip}" if len(chips) > 1 else "") for chip in chips
+        ]
         return (
             "M400",
             *(

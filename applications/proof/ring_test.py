@@ -10,11 +10,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import Literal
 
 import numpy as np
 
-from stillpath.applications.proof.drive import RingingMode, ringing_mode
+from stillpath.applications.proof.drive import AXES, Axis, RingingMode, ringing_mode
 from stillpath.applications.proof.halves import ProofPrint, Ringing, write_proof
 from stillpath.applications.proof.recorders import RingSettings, recorder_for
 from stillpath.gcode.firmware.registry import adapter
@@ -36,9 +36,6 @@ __all__ = [
     "region",
     "write_ring_test",
 ]
-
-Axis: TypeAlias = Literal["x", "y"]
-AXES: tuple[Axis, Axis] = ("x", "y")
 
 REST = " rest"
 PARTS = ("quiet", "off", "off" + REST, "on", "on" + REST)
@@ -71,21 +68,27 @@ class RingTest:
     ----------
     speeds_mm_s : dict
         By axis, in the order of the file.
+    accel_mm_s2 : dict
+        By axis.
+    recorder : Recorder
     """
 
     def __init__(self, machine: Machine, settings: RingSettings) -> None:
         self._machine, self._settings = machine, settings
-        self._stream_commands = adapter(machine).stream_commands()
+        self._firmware_adapter = adapter(machine)
+        self._stream_commands = self._firmware_adapter.stream_commands()
         firmware = machine.firmware
-        self.accel_mm_s2 = firmware.largest_accel_mm_s2
+        self._allowed = {axis: firmware.allowance(axis) for axis in AXES}
         self._z_mm_s = min(10.0, firmware.fastest_z_mm_s)
         self._travel_mm_s = min(_TRAVEL_MM_S, firmware.fastest_mm_s)
         self._middle = {
             a: 0.5 * (machine.travel[a].min_mm + machine.travel[a].max_mm) for a in ("x", "y", "z")
         }
+        self.accel_mm_s2 = {axis: one.accel_mm_s2 for axis, one in self._allowed.items()}
         self.speeds_mm_s: dict[Axis, tuple[float, ...]] = {
             axis: self._speeds(ringing_mode(machine.axes[axis].nominal), axis) for axis in AXES
         }
+        self.recorder = recorder_for(machine, settings)
         self._rests = _rests()
         self._at_mm: dict[Axis, float] = {}
         self._out: list[str] = []
@@ -101,13 +104,13 @@ class RingTest:
         self._add("; STILLPATH_OFF", "G90", "M83", "M220 S100")
         # Both halves are predicted and measured without the firmware's shaper.
         self._add(*self._stream_commands.shaper_off.decode().splitlines())
-        self._add(*self._stream_commands.acceleration(self.accel_mm_s2).decode().splitlines())
+        largest = self._machine.firmware.largest_accel_mm_s2
+        self._add(*self._stream_commands.acceleration(largest).decode().splitlines())
         travel = self._machine.travel["z"]
         height_mm = min(max(travel.min_mm, 0.0) + _HEIGHT_MM, self._middle["z"])
         self._add(f"G1 Z{height_mm:.3f} F{60 * self._z_mm_s:.0f}")
         self._centre()
-        recorder = recorder_for(self._machine.firmware, self._settings)
-        self._add(*recorder.first())
+        self._add(*self.recorder.first())
         for number in range(1, ROUNDS + 1):
             begins = len(self._out)
             seconds = 0.0
@@ -119,11 +122,12 @@ class RingTest:
             self._add("; STILLPATH_ON")
             seconds += self._stops("on")
             self._add("; STILLPATH_OFF", ";TYPE:end")
-            self._out[begins:begins] = recorder.before(number, seconds)
+            self._out[begins:begins] = self.recorder.before(number, seconds)
             self._centre()
-            self._add(*recorder.after(seconds))
-        self._add(*recorder.last())
-        self._add(*(self._stream_commands.shaper_on or b"").decode().splitlines())
+            self._add(*self.recorder.after(seconds))
+        self._add(*self.recorder.last())
+        own = self._stream_commands.acceleration_back(self._firmware_adapter.initial_limits())
+        self._add(*(own + (self._stream_commands.shaper_on or b"")).decode().splitlines())
 
     def _stops(self, half: Literal["off", "on"]) -> float:
         """Move each axis back and forth at every speed; return the approximate duration.
@@ -134,7 +138,7 @@ class RingTest:
         for k in range(len(_SPEEDS_MM_S)):
             for axis in AXES:
                 speed = self.speeds_mm_s[axis][k]
-                length_mm = self._length_mm(speed)
+                length_mm = self._length_mm(axis, speed)
                 for side in (1.0, -1.0):
                     place = self._middle[axis] + side * 0.5 * length_mm
                     rest_s = next(self._rests)
@@ -143,7 +147,7 @@ class RingTest:
                     self._add(f"G1 {axis.upper()}{place:.3f} F{60 * speed:.0f}")
                     self._add(f";TYPE:{region(axis, half + REST)}")
                     self._creep(axis, side * rest_s)
-                    seconds += length_mm / speed + speed / self.accel_mm_s2 + rest_s
+                    seconds += length_mm / speed + speed / self.accel_mm_s2[axis] + rest_s
         return seconds
 
     def _creep(self, axis: Axis, seconds: float) -> None:
@@ -157,9 +161,8 @@ class RingTest:
         """Return speeds near those wanted, within the limits, at which the axis rings most."""
         travel = self._machine.travel[axis]
         room_mm = travel.max_mm - travel.min_mm - 2 * _MARGIN_MM
-        fastest = min(
-            self._machine.firmware.fastest_mm_s, math.sqrt(room_mm * self.accel_mm_s2 / _CRUISE)
-        )
+        allowed_mm_s, accel_mm_s2, _ = self._allowed[axis]
+        fastest = min(allowed_mm_s, math.sqrt(max(room_mm, 0.0) * accel_mm_s2 / _CRUISE))
         if room_mm < _SHORTEST_MM or fastest < 0.5 * _SPEEDS_MM_S[0]:
             raise ModelError(
                 f"the ring test moves {axis} by {_SHORTEST_MM:g} mm at least, at "
@@ -170,12 +173,12 @@ class RingTest:
         for wanted in _SPEEDS_MM_S:
             tried = np.linspace(1.0 - _NEAR, 1.0 + _NEAR, 13) * wanted
             tried = np.minimum(tried, fastest)
-            rings = [mode.ringing_um(v, self.accel_mm_s2) for v in tried]
+            rings = [mode.ringing_um(v, accel_mm_s2) for v in tried]
             out.append(round(float(tried[int(np.argmax(rings))]), 1))
         return tuple(out)
 
-    def _length_mm(self, speed_mm_s: float) -> float:
-        return max(_CRUISE * speed_mm_s**2 / self.accel_mm_s2, _SHORTEST_MM)
+    def _length_mm(self, axis: Axis, speed_mm_s: float) -> float:
+        return max(_CRUISE * speed_mm_s**2 / self.accel_mm_s2[axis], _SHORTEST_MM)
 
     def _centre(self) -> None:
         x, y = self._middle["x"], self._middle["y"]
@@ -207,7 +210,7 @@ def write_ring_test(
     Raises
     ------
     ModelError
-        The travel is too small, or an axis does not ring.
+        The travel is too small, an axis does not ring, or not all can be compensated.
     DesignError, GcodeError
         As of `pipeline.compensate.compensate_file`.
     """
@@ -215,15 +218,22 @@ def write_ring_test(
     program = RingTest(machine, settings)
 
     def legend(_: dict[str, Ringing], result: Result) -> list[str]:
-        recorder = recorder_for(machine.firmware, settings)
-        speeds = {a.upper(): " ".join(f"{v:g}" for v in program.speeds_mm_s[a]) for a in AXES}
+        if result.put_back:
+            raise ModelError(
+                f"{len(result.put_back)} of the {result.pieces} parts of the ring test that should "
+                f"be compensated would stay as planned ({result.put_back[0].reason}), and its logs "
+                "would say nothing: see what the motors bear (`command` of the machine's document)"
+            )
+        stops = [
+            f"{' '.join(f'{v:g}' for v in program.speeds_mm_s[a])} mm/s in {a.upper()} at "
+            f"{program.accel_mm_s2[a]:g} mm/s2"
+            for a in AXES
+        ]
         return [
             f"{TITLE}{machine.title} (model {machine.revision})",
-            "Nothing is printed, nothing is heated: the head stops dead from "
-            + ", ".join(f"{v} mm/s in {a}" for a, v in speeds.items())
-            + f" at {program.accel_mm_s2:g} mm/s2,",
+            f"Nothing is printed, nothing is heated: the head stops dead from {', '.join(stops)},",
             "half of the times as planned, half compensated. Do not touch machine or table.",
-            *recorder.instruction,
+            *program.recorder.instruction,
             ", ".join(plants_line(a, plants_digest(machine.axes[a])) for a in AXES),
             f"Time {result.time_s:.0f} s without homing.",
         ]

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
-from stillpath.applications.proof.drive import Drive, bands, ringing_mode
+from stillpath.applications.proof.drive import Axis, Drive, bands, ringing_mode
 from stillpath.applications.proof.halves import (
     AS_PLANNED,
     COMPENSATED,
@@ -24,7 +23,6 @@ from stillpath.pipeline.result import Result
 __all__ = ["Band", "Tower", "tower_program", "write_tower"]
 
 Point = tuple[float, float]
-Axis = Literal["x", "y"]
 
 _RUN_MM, _WALL_MM = 25.0, 30.0
 _BAND_MM = 5.0
@@ -70,8 +68,7 @@ def tower_program(
     width, depth = (_RUN_MM, _WALL_MM) if axis == "x" else (_WALL_MM, _RUN_MM)
     halves = Halves(machine, settings, width, depth, "tower")
     program = halves.program
-    mode = ringing_mode(machine.axes[axis].nominal)
-    drives = bands(machine, mode, settings.max_flow_mm3_s / program.section_mm2, _RUN_MM, count)
+    drives = bands(machine, axis, settings.max_flow_mm3_s / program.section_mm2, _RUN_MM, count)
     base = halves.begin()
     layers = round(_BAND_MM / program.layer_mm)
     for k, chosen in enumerate(drives):

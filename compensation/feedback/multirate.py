@@ -119,9 +119,16 @@ def fast_rate(rate_hz: float, fundamental_hz: float) -> FastRate:
     Raises
     ------
     Refusal
-        If it is more than 32 times the sampling rate (paper 004 prints 1918.4 kHz for 16 kHz and
-        1199 Hz; it is 19184 kHz, 1199 times).
+        If the fundamental is not below half the sampling rate, or the multiple is more than 32
+        times that rate (paper 004 prints 1918.4 kHz for 16 kHz and 1199 Hz; it is 19184 kHz, 1199
+        times).
     """
+    if not fundamental_hz < 0.5 * rate_hz:
+        raise Refusal(
+            "singular",
+            f"a fundamental of {fundamental_hz:g} Hz is not below half the sampling rate "
+            f"({0.5 * rate_hz:g} Hz): give that of the error as the loop samples it",
+        )
     share = shared_period(rate_hz, fundamental_hz)
     factor, period = share.numerator, share.denominator
     if factor > _LARGEST_FACTOR:

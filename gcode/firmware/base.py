@@ -165,6 +165,9 @@ class StreamCommands(Protocol):
     def acceleration(self, accel_mm_s2: float) -> bytes:
         """Lines that limit the acceleration of X and Y and leave all other limits alone."""
 
+    def acceleration_back(self, limits: Limits) -> bytes:
+        """Lines that put back what those of `acceleration` have changed."""
+
     def in_stream(self, limits: Limits) -> Limits:
         """Return the file's own limits, marked as being in the middle of a stream.
 

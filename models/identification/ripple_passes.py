@@ -36,6 +36,7 @@ from stillpath.models.ripple import RippleAxis
 __all__ = ["learn_machine_ripple", "read_pass"]
 
 _FEWEST_ROWS = 16
+_LONGEST_S, _SLOWEST_S = 3600.0, 0.1
 _DT_S = 0.25e-3
 """Fine against the ripple's waves, which the lines between samples would flatten."""
 
@@ -71,6 +72,13 @@ def read_pass(text: str, source: str) -> PassLog:
     back = np.flatnonzero(np.diff(time_s) <= 0)
     if len(back):
         raise table.at(int(back[0]) + 1, "time_s does not rise; sort the rows, or cut the log")
+    lasts_s, apart_s = float(time_s[-1] - time_s[0]), float(np.median(np.diff(time_s)))
+    if lasts_s > _LONGEST_S or apart_s > _SLOWEST_S:
+        raise ModelError(
+            f"{source}: by its time it lasts {lasts_s:.6g} s and its rows are {apart_s:.4g} s "
+            f"apart; up to {_LONGEST_S:g} s and {_SLOWEST_S:g} s are read: time_s must be in "
+            "seconds; of a longer log hand in a part"
+        )
     since = time_s - time_s[0]
     grid = np.arange(int(since[-1] / _DT_S) + 1) * _DT_S
     homed = any(c.strip("#; \t").lower() == "homed" for c in table.comments)

@@ -144,7 +144,8 @@ def list_machines(request: Request, _: Reader) -> list[MachineSummary]:
     """Return the machines a job can name: the library, then the user's own."""
     store = _store(request)
     own = [_own_summary(store, name) for name in store.names()]
-    return [*(MachineSummary.of(load_machine(name)) for name in builtin_machines()), *own]
+    library = [name for name in builtin_machines() if name not in store]
+    return [*(MachineSummary.of(load_machine(name)) for name in library), *own]
 
 
 @router.get(

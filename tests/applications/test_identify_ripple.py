@@ -59,6 +59,14 @@ def test_refusals_leave_nothing(folder: Path, capsys: pytest.CaptureFixture[str]
     assert "--axis" in capsys.readouterr().err
 
 
+def test_a_title_that_no_machine_has(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    made = ("--base", str(folder / "base.json"), "-o", str(folder / "out.json"))
+    assert learn(folder, *made, "--title", 201 * "t") == 2
+    said = capsys.readouterr().err
+    assert "title" in said
+    assert said.count("\n") == 1
+
+
 def test_parts() -> None:
     basis = parse_basis("motor pole:0.8:1,4@output")
     assert (basis.name, basis.pitch_mm, basis.numbers) == ("motor pole", 0.8, (1, 4))
@@ -66,7 +74,9 @@ def test_parts() -> None:
     assert parse_basis("belt:2").numbers == (1, 2, 3)
 
 
-@pytest.mark.parametrize("text", ["belt", "belt:x", "belt:2:0", "belt:2:1,1", "belt:2@side", ":2"])
+@pytest.mark.parametrize(
+    "text", [f"{65 * 'b'}:2", "belt", "belt:x", "belt:2:0", "belt:2:1,1", "belt:2@side", ":2"]
+)
 def test_parts_that_are_not(text: str) -> None:
     with pytest.raises(ModelError, match="--ripple"):
         parse_basis(text)

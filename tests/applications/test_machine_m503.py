@@ -164,6 +164,30 @@ def test_an_own_machine_takes_a_later_answer_and_keeps_what_that_does_not_say(
     assert "firmware.planner.accel_mm_s2: 510 -> 900" in capsys.readouterr().out
 
 
+def test_what_m503_rounds_stays_exact(make, capsys, tmp_path: Path) -> None:
+    """J0.013 and K0.045 are printed as J0.01 and K0.05."""
+    exact = ("--set", "planner.junction_deviation_mm=0.013", "--set", "linear_advance_k_s=0.045")
+    text = M503.replace("J0.08", "J0.01")
+    out = make(text, *exact)[1]
+    note = next(line for line in out.splitlines() if line.startswith("rounded by M503"))
+    assert "shaper.damping_x=0.15" in note
+    assert "linear_advance_k_s" not in note
+    file = tmp_path / "later.txt"
+    file.write_text(text.replace("P510.00", "P900.00"))
+    assert run(["machines", "set-firmware", "mine", str(file)]) == 0
+    capsys.readouterr()
+    firmware = stored(capsys).firmware
+    assert firmware.planner.accel_mm_s2 == 900
+    assert firmware.planner.junction_deviation_mm == 0.013
+    assert firmware.linear_advance_k_s == 0.045
+    file.write_text(text.replace("J0.01", "J0.02").replace("K0.05", "K0.00"))
+    assert run(["machines", "set-firmware", "mine", str(file)]) == 0
+    capsys.readouterr()
+    firmware = stored(capsys).firmware
+    assert firmware.planner.junction_deviation_mm == 0.02
+    assert firmware.linear_advance_k_s == 0.0
+
+
 def test_a_machine_of_another_firmware_becomes_one_with_marlin(capsys, tmp_path: Path) -> None:
     file = tmp_path / "m503.txt"
     file.write_text(M503)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import multiprocessing
@@ -29,6 +30,7 @@ from stillpath.applications.machines.revision import (
 from stillpath.applications.machines.settings import user_data_dir
 from stillpath.applications.machines.store import MachineStore
 from stillpath.applications.machines.transfer import export_history, import_file
+from stillpath.cli.main import run
 from stillpath.models.errors import ModelError
 from stillpath.models.store import builtin_machines, load_machine
 from stillpath.service.database.documents import DocumentTable
@@ -255,6 +257,19 @@ def test_a_full_disk_leaves_the_old_state(
     assert store.current("mine").number == 1
 
 
+def test_a_file_system_without_hard_links_is_named(
+    store: MachineStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def refused(*_: object, **__: object) -> None:
+        raise OSError(errno.EOPNOTSUPP, "Operation not supported")
+
+    monkeypatch.setattr(os, "link", refused)
+    with pytest.raises(OSError, match="no hard links: put STILLPATH_DATA_DIR on a local disk"):
+        store.add_revision("mine", make_machine(), author="anna")
+    assert files_of(tmp_path) == []
+    assert not (tmp_path / "machines" / "mine").exists()
+
+
 # Several writers
 
 
@@ -376,6 +391,27 @@ def test_a_name_is_found_wherever_it_is(store: MachineStore, tmp_path: Path):
     assert resolver.for_job(str(file), files=True).machine.name == "file"
     with pytest.raises(UnknownMachine):
         resolver.for_job(str(file))
+
+
+def test_a_user_s_machine_is_not_shadowed_by_one_built_in_later(
+    store: MachineStore,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    with monkeypatch.context() as earlier:  # a version whose library had no such machine
+        earlier.setattr("stillpath.applications.machines.store.builtin_machines", list)
+        store.add_revision("ender3", make_machine("ender3"), author="anna")
+    monkeypatch.setenv("STILLPATH_DATA_DIR", str(tmp_path))
+    assert run(["machines"]) == 0
+    listed = [line for line in capsys.readouterr().out.splitlines() if line.startswith("ender3 ")]
+    assert len(listed) == 1
+    assert "built in" not in listed[0]
+    resolver = Resolver(store)
+    assert resolver.for_job("ender3").number == 1
+    assert resolver.names().count("ender3") == 1
+    with pytest.raises(NotApproved):
+        Resolver(store, require_approval=True).for_job("ender3")
 
 
 def test_where_approval_is_required(store: MachineStore, tmp_path: Path):

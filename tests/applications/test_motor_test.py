@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
@@ -52,13 +53,60 @@ def test_what_the_console_says(console: Callable[..., str]) -> None:
     levels = levels_of(motor_test(load_machine("ender3"), 9000.0))
     fine = [(100, -200), (103, -198), (96, -205), (100, -215)]
     assert len(levels) == 4
-    assert borne(levels, console((0, 0), *fine, fine[0]), 16) == 4
+    assert borne(levels, console(*fine, fine[0]), 16) == 4
     assert borne(levels, console(*fine, (1000, 0)), 16) == 3
     assert borne(levels, console(fine[0], (100, -216), *fine[:3]), 16) == 0
     with pytest.raises(ModelError, match="holds 4 answers"):
         borne(levels, console(*fine), 16)
     with pytest.raises(ModelError, match="has no levels"):
         levels_of("G28")
+
+
+FINE = [(0, 0)] * 5
+START, RESUMED = (f"Starting SD card print (position {at})" for at in (0, 7))
+
+
+def echoed(
+    most: float, counts: list[tuple[int, int]], over: str = "echo: the search is over\n"
+) -> str:
+    """Return a console with the lines of M118, as a host shows what it sends and receives."""
+    told = levels_of(motor_test(load_machine("ender3"), most))
+    lines = [f"Recv: {console(counts[0])}"]
+    for number, (level, count) in enumerate(zip(told, counts[1:], strict=False), 1):
+        text = (
+            f"level {number}: accel {level.accel_mm_s2:.0f} mm/s2, "
+            f"step {level.speed_step_mm_s:.1f} mm/s"
+        )
+        lines += [f"Send: M118 {text}", f"echo: {text}", f"Recv: {console(count)}"]
+    return "\n".join([*lines, over])
+
+
+def logged(*runs: str) -> str:
+    return "".join(f"{START}\n{run}\nExiting SD card print (position 9)\n" for run in runs)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (logged(console(*FINE, (0, 0)), console(*FINE)), 4),
+        (logged(f"{console(*FINE[:3])}\n{RESUMED}\n{console(*FINE[:2])}"), 4),
+        (logged(console(*FINE), "another print"), 4),
+        (logged(console(*FINE), console(*FINE[:4])), "holds 4 answers"),
+        (console((0, 0), *FINE), "holds 6 answers"),
+        (echoed(6000.0, FINE[:2]) + echoed(9000.0, FINE) + console((50, 50)), 4),
+        (echoed(9000.0, FINE) + echoed(9000.0, FINE[:4], ""), "last search has no end"),
+        (echoed(9000.0, FINE[:4]), "other levels"),
+        (echoed(12000.0, FINE), "other levels"),
+        ("\n".join(reversed(echoed(9000.0, FINE).splitlines())), "oldest line first"),
+    ],
+)
+def test_only_one_whole_run_counts(text: str, said: int | str) -> None:
+    levels = levels_of(motor_test(load_machine("ender3"), 9000.0))
+    if isinstance(said, int):
+        assert borne(levels, text, 16) == said
+        return
+    with pytest.raises(ModelError, match=said):
+        borne(levels, text, 16)
 
 
 def test_answers_of_two_printers_are_refused() -> None:
@@ -73,6 +121,10 @@ def test_other_firmwares_and_limits_that_are_not_above() -> None:
         motor_test(ender3_with("marlin"), 9000.0)
     with pytest.raises(ModelError, match="5000 mm/s2 already"):
         motor_test(load_machine("ender3"), 5000.0)
+    for most in (1e12, math.inf, math.nan):
+        with pytest.raises(ModelError, match=r"beyond 16 levels .* search up to 142109 at most"):
+            motor_test(load_machine("ender3"), most)
+    assert len(levels_of(motor_test(load_machine("ender3"), 142_108.0))) == 16
 
 
 def test_from_the_search_to_the_machine(

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from stillpath.applications.machines.checks import with_firmware
 from stillpath.applications.proof.coupon import coupon_program
 from stillpath.applications.proof.drive import ringing_mode
 from stillpath.applications.proof.program import PrintSettings
+from stillpath.applications.proof.recorders import RingSettings
+from stillpath.applications.proof.ring_test import RingTest
 from stillpath.applications.proof.tower import tower_program, write_tower
 from stillpath.cli.main import run
+from stillpath.cli.proof import PrintOptions
 from stillpath.gcode.firmware.klipper.planner import Planner
 from stillpath.gcode.firmware.planning import join_phases
+from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.types import Moves, joined
 from stillpath.models.errors import ModelError
 from stillpath.models.firmware.klipper import FirmwareShaper
@@ -26,6 +33,7 @@ from stillpath.simulation.response import response
 from tests.gcode.cutting import blocks_of
 
 SETTINGS = PrintSettings()
+EXAMPLES = Path(__file__).parents[2] / "examples" / "firmware"
 COUPONS = ("voron-v24-250", "generic-bedslinger", "annex-k3", "taz6-x")
 """Machines whose coupons `test_proof_readback` reads back as well; of the others, towers."""
 
@@ -82,6 +90,41 @@ def test_planned_prints_are_sound(what, name):
         assert 5 * 60 <= float(time_s) <= 10 * 60
 
 
+@pytest.mark.parametrize("what", ["coupon", "tower x", "tower y", "ring test"])
+@pytest.mark.parametrize("kind", ["marlin", "reprapfirmware"])
+def test_each_axis_keeps_its_own_limits(kind, what):
+    """On a bed slinger whose bed may less than its head."""
+    machine = with_limits_of_each_axis(kind)
+    if what == "ring test":
+        text = RingTest(machine, RingSettings()).text()
+    else:
+        text = text_of(what, machine)
+    blocks = blocks_of(text.encode(), machine)
+    own = adapter(machine).initial_limits()
+    limits = [one for block in blocks for one in block.limits]
+    assert {one.accel_x_mm_s2 for one in limits} == {own.accel_x_mm_s2}
+    assert {one.accel_y_mm_s2 for one in limits} == {own.accel_y_mm_s2}
+    assert blocks[-1].limits[int(blocks[-1].events.limits_id[-1])] == own
+
+
+def with_limits_of_each_axis(kind: str) -> Machine:
+    section = json.loads((EXAMPLES / f"{kind}.json").read_text())
+    for axis, accel_mm_s2 in (("x", 3000.0), ("y", 1000.0)):
+        if kind == "marlin":
+            section["planner"]["max_accel_mm_s2"][axis] = accel_mm_s2
+        else:
+            section[axis]["max_accel_mm_s2"] = accel_mm_s2
+    return with_firmware(load_machine("generic-bedslinger"), section)
+
+
+def test_drives_are_what_the_axes_shown_can_do():
+    machine = with_limits_of_each_axis("reprapfirmware")
+    assert coupon_program(machine, SETTINGS)[1].accel_mm_s2 <= 1000.0
+    top = {axis: tower_program(machine, axis, SETTINGS, 4)[1][-1].accel_mm_s2 for axis in "xy"}
+    assert top["y"] <= 1000.0 < top["x"] <= 3000.0
+    assert RingTest(machine, RingSettings()).accel_mm_s2 == {"x": 3000.0, "y": 1000.0}
+
+
 @pytest.mark.parametrize("name", builtin_machines())
 def test_walls_ring_as_they_can_be_seen(name):
     machine = load_machine(name)
@@ -133,6 +176,8 @@ def test_too_small_a_bed_is_refused_with_the_reason():
         coupon_program(small, SETTINGS)
     with pytest.raises(ModelError, match="around x = 20 mm"):
         coupon_program(machine, PrintSettings(centre_mm=(20.0, 100.0)))
+    with pytest.raises(ModelError, match="around x = nan mm"):
+        coupon_program(machine, PrintSettings(centre_mm=(math.nan, 100.0)))
     with pytest.raises(ModelError, match="nozzle temperature 20 is outside 150 to 350"):
         coupon_program(machine, PrintSettings(nozzle_temp_c=20))
     with pytest.raises(ModelError, match="13 bands"):
@@ -186,6 +231,13 @@ def test_own_lines_at_start_and_end_and_the_shaper_put_back():
     assert default[:5] == ["M140 S60", "M104 S210", "G28", "M190 S60", "M109 S210"]
     assert "M104 S0" in default[-6:]
     assert "M140 S0" in default[-6:]
+
+
+def test_own_lines_may_begin_with_a_byte_order_mark(tmp_path):
+    (tmp_path / "start.gcode").write_text("\ufeffSTART_PRINT\n", encoding="utf-8")
+    assert PrintOptions(start_gcode=tmp_path / "start.gcode").chosen().start_gcode == (
+        "START_PRINT\n"
+    )
 
 
 @pytest.mark.slow

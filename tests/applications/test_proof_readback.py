@@ -15,7 +15,9 @@ from stillpath.applications.proof.program import PrintSettings
 from stillpath.applications.proof.readback import verify_log
 from stillpath.applications.proof.tower import tower_program
 from stillpath.models.errors import ModelError
+from stillpath.models.firmware.klipper import FirmwareShaper
 from stillpath.models.machine import Machine
+from stillpath.models.shaping import AxisShaper, Shaping
 from stillpath.models.store import load_machine
 from tests.service.recorded import record
 
@@ -77,6 +79,33 @@ def test_a_mode_that_fell_is_found_and_said(machine, printed, tmp_path):
     assert json.loads((tmp_path / "report" / "readback.json").read_text())["machine"] == "ender3"
 
 
+@pytest.mark.parametrize(
+    ("told", "type_", "outcome", "said"),
+    [
+        (True, "mzv", "the model holds", "the model holds"),
+        (True, "none", "the model holds", "the model holds"),
+        (False, "mzv", "the shaper is not known", "nothing is said of the machine"),
+        (False, "none", "the model holds", "the model holds"),
+    ],
+)
+def test_the_firmware_s_shaper(told, type_, outcome, said, machine, printed, tmp_path):
+    """In a file as sliced, which leaves the shaper as printer.cfg has it."""
+    sliced, log = tmp_path / "sliced.gcode", tmp_path / "log.csv"
+    lines = printed.read_text().splitlines(keepends=True)
+    sliced.write_text("".join(x for x in lines if not x.startswith("SET_INPUT_SHAPER")))
+    axes = [AxisShaper(type_, machine.axes[a].nominal.modes[1].f_hz) for a in "xy"]
+    record(sliced, machine, log, start_s=280, seconds=40, shaping=Shaping(*axes))
+    stated = None
+    if told:
+        x_hz, y_hz = (axis.f_hz if axis.is_on else 0.0 for axis in axes)
+        stated = FirmwareShaper(freq_x_hz=x_hz, freq_y_hz=y_hz)
+    firmware = machine.firmware.model_copy(update={"shaper": stated})
+    report = verify_log(sliced, log, machine.model_copy(update={"firmware": firmware}))
+    assert report.outcome == outcome
+    assert all(said in verdict for verdict in report.verdicts), report.verdicts
+    assert any("firmware.shaper" in note for note in report.notes) is not told
+
+
 def test_a_log_of_another_print_is_recognised(machine, printed, tmp_path):
     other = tmp_path / "tower.gcode"
     other.write_text(tower_program(machine, "y", PrintSettings(), 2)[0].text())
@@ -102,12 +131,15 @@ def test_a_sensor_on_the_head_of_a_bed_slinger_sees_x_only(machine, printed, tmp
     assert any("no motion of Y" in note for note in report.notes)
 
 
-@pytest.mark.slow
-def test_a_wrong_scale_is_not_taken_for_a_change_of_the_machine(machine, printed, tmp_path):
-    record(printed, machine, tmp_path / "log.csv", sees=(0.7, 0.7), start_s=300)
+@pytest.mark.parametrize("scale", [pytest.param(0.70, marks=pytest.mark.slow), 0.01, 1000])
+def test_a_wrong_scale_is_not_taken_for_a_change_of_the_machine(scale, machine, printed, tmp_path):
+    log = tmp_path / "log.csv"
+    noise = {"noise_mm_s2": 60.0 * scale, "step_mm_s2": 37.0 * scale}
+    record(printed, machine, log, sees=(scale, scale), start_s=300, **noise)
     report = verify_log(printed, tmp_path / "log.csv", machine)
     assert modes(report)["x"] == pytest.approx(1.0, abs=0.002)
-    assert all("reads 0.70 of the predicted" in verdict for verdict in report.verdicts)
+    read = [float(re.search(r"reads (\S+) of the predicted", v)[1]) for v in report.verdicts]
+    assert read == pytest.approx([scale, scale], rel=0.02)
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import re
 from dataclasses import replace
 from datetime import date
 from pathlib import Path
@@ -11,19 +12,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from stillpath.applications.machines.checks import with_firmware
 from stillpath.applications.proof.confirming import verify_ring
 from stillpath.applications.proof.recorders import RingSettings
 from stillpath.applications.proof.ring_figures import RingReport
 from stillpath.applications.proof.ring_motion import is_ring_test, read_ring_motion
-from stillpath.applications.proof.ring_test import RingTest, write_ring_test
+from stillpath.applications.proof.ring_test import (
+    TITLE,
+    RingTest,
+    plants_line,
+    write_ring_test,
+)
 from stillpath.cli.main import run
 from stillpath.cli.own_machines import open_machines
-from stillpath.models.confirmation import Confirmation, confirmation_text
+from stillpath.models.confirmation import Confirmation, confirmation_text, plants_digest
 from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine
 from tests.service.ringing import SENSOR, TRUE, Chain, machine_of, recorded
 
+EXAMPLES = Path(__file__).parents[2] / "examples" / "firmware"
 TODAY = date(2026, 11, 24)
 
 
@@ -83,21 +91,63 @@ def test_it_stays_within_the_travel_and_extrudes_nothing(ring: Path, machine: Ma
 
 
 def test_klipper_logs_every_sensor_once(machine: Machine) -> None:
-    lines = RingTest(machine, RingSettings("head", "bed")).text().splitlines()
-    logged = [line for line in lines if line.startswith("ACCELEROMETER")]
+    *logged, name = logged_lines(machine, RingSettings("head", "bed"))
     assert logged == [
         "ACCELEROMETER_MEASURE CHIP=head",
         "ACCELEROMETER_MEASURE CHIP=bed",
-        "ACCELEROMETER_MEASURE CHIP=head NAME=ring",
-        "ACCELEROMETER_MEASURE CHIP=bed NAME=ring",
+        f"ACCELEROMETER_MEASURE CHIP=head NAME={name}",
+        f"ACCELEROMETER_MEASURE CHIP=bed NAME={name}",
     ]
 
 
-def test_a_travel_without_room_is_refused(machine: Machine) -> None:
+def logged_lines(machine: Machine, settings: RingSettings) -> list[str]:
+    """Return the lines that log, and at the end the name of the logs."""
+    lines = RingTest(machine, settings).text().splitlines()
+    logged = [line for line in lines if line.startswith("ACCELEROMETER")]
+    return [*logged, logged[-1].partition("NAME=")[2]]
+
+
+def test_logs_have_the_name_of_their_own_test(machine: Machine, told: RingReport) -> None:
+    """The log of another test is not there to be taken for this one's."""
+    settings = RingSettings()
+    name = logged_lines(machine, settings)[-1]
+    assert re.fullmatch("ring-[0-9a-f]{6}", name)
+    assert logged_lines(confirmed(machine, told), settings)[-1] == name
+    other = machine_of({"x": Chain((45.0, 120.0)).spec(), "y": TRUE["y"].spec()})
+    assert logged_lines(other, settings)[-1] != name
+    instruction = " ".join(RingTest(machine, settings).recorder.instruction)
+    assert f"/tmp/*-{name}.csv" in instruction
+    assert "send `ACCELEROMETER_MEASURE` once before" in instruction
+
+
+@pytest.mark.parametrize("kind", ["marlin", "reprapfirmware"])
+def test_other_firmwares_have_ring_tests(
+    kind: str, machine: Machine, cache: Path, tmp_path: Path
+) -> None:
+    section = json.loads((EXAMPLES / f"{kind}.json").read_text())
+    made = with_firmware(machine, section)
+    write_ring_test(made, tmp_path / "ring.gcode", cache_dir=cache)
+    motion = read_ring_motion(tmp_path / "ring.gcode", made)
+    assert len(motion.of("y", compensated=True)) == 12
+
+
+@pytest.mark.slow
+def test_one_that_stays_as_planned_is_not_written(
+    machine: Machine, cache: Path, tmp_path: Path
+) -> None:
+    command = machine.command.model_copy(update={"accel_mm_s2": 3000.0, "speed_step_mm_s": 1.0})
+    weak = machine.model_copy(update={"command": command})
+    with pytest.raises(ModelError, match=r"2 of the 2 parts .* would stay as planned"):
+        write_ring_test(weak, tmp_path / "ring.gcode", cache_dir=cache)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("reach_mm", [10.0, 30.0])
+def test_a_travel_without_room_is_refused(machine: Machine, reach_mm: float) -> None:
     small = machine.model_copy(
         update={
             "travel": machine.travel
-            | {"x": machine.travel["x"].model_copy(update={"min_mm": 0.0, "max_mm": 30.0})}
+            | {"x": machine.travel["x"].model_copy(update={"min_mm": 0.0, "max_mm": reach_mm})}
         }
     )
     with pytest.raises(ModelError, match=r"moves x by 20 mm at least.*correct the machine"):
@@ -177,6 +227,18 @@ def test_a_ring_test_for_other_plants_says_nothing(ring: Path, log: Path) -> Non
     report = verify_ring(ring, [log], other, today=TODAY)
     assert verdicts(report) == ["says nothing", "confirmed"]
     assert "write a new ring test" in report.axes[0].text
+
+
+def test_a_half_that_is_not_compensated_says_nothing(machine: Machine, tmp_path: Path) -> None:
+    """As was written where all pieces stayed as planned."""
+    ring = tmp_path / "ring.gcode"
+    plants = ", ".join(plants_line(a, plants_digest(machine.axes[a])) for a in ("x", "y"))
+    text = RingTest(machine, RingSettings()).text()
+    ring.write_text(f"; {TITLE}{machine.title}\n; {plants}\n{text}")
+    content = recorded(ring, machine).raw_data()
+    report = said_of(tmp_path / "a.csv", ring, machine, content)
+    assert verdicts(report) == ["says nothing", "says nothing"]
+    assert all("write a new ring test" in axis.text for axis in report.axes)
 
 
 def test_a_log_without_raw_accelerations_is_refused(

@@ -292,6 +292,16 @@ def test_resonances_that_are_none(store: MachineStore, config: Path, capsys, her
     [
         ("max_velocity: 300", "max_velocity: fast", ["line 6", "max_velocity", "fast"]),
         ("max_velocity: 300", "max_velocity: nan", ["line 6", "max_velocity"]),
+        (
+            "max_accel = 4000",
+            "max_accel = 0\nmax_accel_to_decel = 100",
+            ["[printer] max_accel: 0 must be above 0"],
+        ),
+        (
+            "filament_diameter: 1.75",
+            "filament_diameter: 0",
+            ["[extruder] filament_diameter: 0 must be above 0"],
+        ),
         ("max_accel = 4000", "", ["[printer] lacks max_accel", "mainsail.cfg", "not followed"]),
         ("kinematics: corexy", "kinematics: delta", ["kinematics delta: only", "as sliced"]),
         ("[stepper_z]", "[stepper_q]", ["travel", "z"]),

@@ -238,7 +238,7 @@ def test_words_around_the_firmwares_own_shaper() -> None:
     assert stream_commands.shaper_off == b'M593 P"none"\nM572 S0\n'
     assert stream_commands.shaper_on == b'M593 P"zvd" F40.5 S0.12\nM572 S0.04\n'
     assert RepRapStreamCommands(firmware(), 0.0).shaper_on == b'M593 P"none"\nM572 S0\n'
-    assert stream_commands.acceleration(1500.0) == b"G1\nM201 X1500 Y1500\nM204 P1500 T1500\n"
+    assert stream_commands.acceleration(1500.0) == b"G1\nM204 P1500 T1500\n"
 
 
 def test_limits_wait_until_the_move_before_them_is_planned() -> None:

@@ -137,6 +137,13 @@ def test_where_ripple_cannot_enter(
             "time_s,position_mm,measured_mm\n" + "".join(f"{k % 10},{k},{k}\n" for k in range(20)),
             "line 12: time_s does not rise",
         ),
+        *(
+            (
+                "time_s,position_mm,measured_mm\n" + "".join(f"{s * k},1,1\n" for k in range(20)),
+                rf"lasts {19 * s:g} s and its rows are {s} s apart; .* must be in seconds",
+            )
+            for s in (1, 200)
+        ),
         ("time_s,position_mm,measured_mm\n" + "0,1,x\n" * 20, "line 2.*measured_mm"),
         ("time_s,place_mm,measured_mm\n0,1,1\n1,1,1\n", "position_mm"),
     ],

@@ -9,6 +9,8 @@ import numpy as np
 
 from stillpath.models.machine import Machine
 from stillpath.models.plants import discretise
+from stillpath.models.shaping import OFF, Shaping
+from stillpath.pipeline.shaping import shaped
 from stillpath.pipeline.simulate import plan_file
 from stillpath.simulation.response import PlantStream
 
@@ -33,6 +35,7 @@ def record(
     noise_mm_s2: float = 60.0,
     step_mm_s2: float = 37.0,
     seed: int = 0,
+    shaping: Shaping = OFF,
     rrf: bool = False,
 ) -> None:
     """Write what a sensor of unknown mounting records during a print.
@@ -45,6 +48,8 @@ def record(
         How much of X and Y the sensor takes part in.
     clock : float
         Log seconds in a second of the print.
+    shaping : Shaping
+        The firmware's shaper, if the file sets none.
     rrf : bool
         As RepRapFirmware's M956 writes it, else as Klipper does.
     """
@@ -53,6 +58,8 @@ def record(
         plan_file(printed, motion, machine, rate_hz=_RATE_HZ)
         with np.load(motion) as columns:
             position = np.stack([columns["x"], columns["y"]])
+    if shaping.is_on:
+        position = shaped(position, shaping, 1 / _RATE_HZ)
     plants = [
         discretise(machine.axes[axis].nominal.scaled(factor, damping), 1 / _RATE_HZ)
         for axis, factor in zip(("x", "y"), frequency, strict=True)

@@ -87,6 +87,10 @@ class KlipperStreamCommands:
         """Return the line that sets the acceleration."""
         return f"SET_VELOCITY_LIMIT ACCEL={accel_mm_s2:g}\n".encode()
 
+    def acceleration_back(self, limits: Limits) -> bytes:
+        """Return the line that sets the limits' acceleration."""
+        return self.acceleration(cast(KlipperLimits, limits).accel_mm_s2)
+
     def in_stream(self, limits: Limits) -> Limits:
         """Mark the file's own limits as being in the middle of a stream."""
         own = cast(KlipperLimits, limits)

@@ -138,6 +138,12 @@ class MarlinStreamCommands:
         accel = _number(float(f"{accel_mm_s2:g}"))
         return f"M204 P{accel} T{accel}\n".encode()
 
+    def acceleration_back(self, limits: Limits) -> bytes:
+        """Return the line that sets the limits' accelerations of these moves."""
+        own = cast(MarlinLimits, limits)
+        accels = _number(own.print_accel_mm_s2), _number(own.travel_accel_mm_s2)
+        return "M204 P{} T{}\n".format(*accels).encode()
+
     def in_stream(self, limits: Limits) -> Limits:
         """Return the limits with linear advance off: a rest's own moves know none.
 

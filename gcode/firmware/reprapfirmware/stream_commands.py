@@ -93,9 +93,15 @@ class RepRapStreamCommands:
         return "".join(f"{line}\n" for line in lines).encode()
 
     def acceleration(self, accel_mm_s2: float) -> bytes:
-        """Return the line that limits the acceleration of X and Y."""
+        """Return the line that limits the acceleration of X and Y; M201 still limits each axis."""
         accel = _number(accel_mm_s2)
-        return f"{_FENCE}\nM201 X{accel} Y{accel}\nM204 P{accel} T{accel}\n".encode()
+        return f"{_FENCE}\nM204 P{accel} T{accel}\n".encode()
+
+    def acceleration_back(self, limits: Limits) -> bytes:
+        """Return the line that sets the limits' M204."""
+        own = cast(RepRapLimits, limits)
+        accels = _number(own.print_accel_mm_s2), _number(own.travel_accel_mm_s2)
+        return "{}\nM204 P{} T{}\n".format(_FENCE, *accels).encode()
 
     def in_stream(self, limits: Limits) -> Limits:
         """Return the file's own limits."""

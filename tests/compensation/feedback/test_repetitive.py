@@ -97,6 +97,8 @@ class TestPublished:
         # The paper prints 1918.4 kHz.
         with pytest.raises(Refusal, match="19184000"):
             fast_rate(16_000, 1199)
+        with pytest.raises(Refusal, match=r"1e\+06 Hz is not below half the sampling rate"):
+            fast_rate(10_000, 1e6)
 
 
 def test_instant_margin_is_that_of_a_narrow_design() -> None:
