@@ -99,7 +99,7 @@ def main() -> None:
     parser.add_argument("--files", nargs="+", default=list(FILES), help="paths, or corpus names")
     parser.add_argument("--machines", nargs="+", default=list(MACHINES), help="names or .json")
     parser.add_argument("--method", default="fbf")
-    parser.add_argument("--robust", default="off")
+    parser.add_argument("--robust", default="auto")
     parser.add_argument("--shared", type=Path, help="default: $STILLPATH_SHARED or ../shared")
     parser.add_argument("--cache", type=Path, default=default_cache_dir() / "benchmarks")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
