@@ -198,10 +198,10 @@ def check_output(target: Path) -> Path:
     return target
 
 
-def check_folder(folder: Path | None) -> None:
-    """Refuse a folder for a report that is a file."""
+def check_folder(folder: Path | None, option: str = "--report") -> None:
+    """Refuse a folder to write into that is a file."""
     if folder is not None and folder.exists() and not folder.is_dir():
-        raise Refused(f"--report {folder} is a file; name a folder")
+        raise Refused(f"{option} {folder} is a file; name a folder")
 
 
 def chosen_options(**given: Any) -> Options:
