@@ -319,9 +319,22 @@ def delete(name: Name) -> None:
 
 
 @app.command()
-def restore(name: Name) -> None:
-    """Bring back the machine that was deleted last under a name."""
-    _print_revision(open_machines().store.restore(name))
+def restore(
+    name: Name,
+    number: Annotated[
+        int | None,
+        typer.Option(
+            "--number",
+            min=1,
+            help="Which one, if several were deleted: 1 is the first. [default: the last]",
+        ),
+    ] = None,
+) -> None:
+    """Bring back a machine that was deleted under a name."""
+    store = open_machines().store
+    _print_revision(store.restore(name, number))
+    for other, when in enumerate(store.trash(name), 1):
+        typer.echo(f"also in the trash: number {other}, deleted {when}")
 
 
 @app.command()

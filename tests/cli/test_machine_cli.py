@@ -125,7 +125,11 @@ def test_a_machine_through_its_life(store: MachineStore, tmp_path: Path, capsys)
     assert machines() == 0
     assert "mine" in capsys.readouterr().out
     assert machines("delete", "mine") == 0
-    assert machines("restore", "mine") == 0
+    assert machines("import", file) == 0
+    assert machines("delete", "mine") == 0
+    capsys.readouterr()
+    assert machines("restore", "mine", "--number", 1) == 0
+    assert "also in the trash: number 1, deleted " in capsys.readouterr().out
     assert store.current("mine").number == 3
     assert store.current("mine").restored == 1
 
