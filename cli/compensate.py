@@ -52,7 +52,7 @@ def compensate(
         raise Refused("give either -o OUT or --in-place")
     options = how.chosen(plate)
     check_input(source)
-    target = check_output(output or source)
+    target = check_output(output or source, machine)
     if output is not None and target.exists() and target.samefile(source):
         raise Refused(f"{output} is the input; name another file, or use --in-place instead of -o")
     check_folder(report)

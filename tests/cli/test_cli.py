@@ -168,6 +168,31 @@ def test_bad_requests(pipeline, source, tmp_path, capsys, arguments, words):
     assert sorted(tmp_path.iterdir()) == [source]
 
 
+@pytest.mark.parametrize(
+    "command",
+    [
+        "compensate {source} -m {file} -o {file}",
+        "remove-advice {file} -o {file}",
+        "trajectories {file} -m ender3 -o {file}",
+        "identify {file} -o {file}",
+        "identify {file}@z=150 -o {file}",
+        "coupon -m ender3 --start-gcode {file} -o {file}",
+        "tower -m ender3 --axis x --end-gcode {file} -o {file}",
+        "ring-test -m {file} -o {file}",
+        "motor-test -m {file} -o {file}",
+        "klipper export -m {file} -o {file}",
+        "controller -m nrr --options {file} --json {file}",
+        "scan {source} -m galvo --disturbance {file} -o {file}",
+    ],
+)
+def test_no_input_is_an_output(source, tmp_path, capsys, command):
+    file = tmp_path / "mine.csv"
+    file.write_text("measured")
+    assert run(command.format(source=source, file=file).split()) == 2
+    assert f"{file} is an input of this command" in one_line(capsys)
+    assert file.read_text() == "measured"
+
+
 @pytest.mark.parametrize("name", ["missing.gcode", "."])
 def test_bad_inputs(pipeline, tmp_path, capsys, name):
     assert compensate(tmp_path / name, "-o", str(tmp_path / "o"), "-m", "ender3") == 2
