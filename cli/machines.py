@@ -428,11 +428,11 @@ def from_m503(
     """Make a machine from Marlin's M503: limits and steps, with plants still to be measured."""
     from stillpath.applications.machines import marlin_settings
     from stillpath.applications.machines.revision import source_file
-    from stillpath.models.user_files import read_bytes
+    from stillpath.models.user_files import as_utf8, read_bytes
 
     content = read_bytes(file, _LARGEST_LOG_BYTES, "keep M503's answer only")
     machine = marlin_settings.machine_from_m503(
-        content.decode(errors="replace"),
+        as_utf8(content).decode(errors="replace"),
         file.name,
         _stated(made),
         travel_mm=marlin_settings.read_travel(travel),
