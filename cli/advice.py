@@ -24,7 +24,7 @@ def remove_advice(
     if in_place == (output is not None):
         raise Refused("give either -o OUT or --in-place")
     check_input(source)
-    target = check_output(output or source)
+    target = check_output(output, source) if output else check_output(source)
 
     from stillpath.pipeline.advising.removing import remove_advice as remove
 

@@ -185,8 +185,14 @@ def check_input(source: Path) -> None:
         raise Refused(f"{source} is a pipe or a device; save it as a file first")
 
 
-def check_output(target: Path) -> Path:
-    """Refuse a place that cannot be written, before anything is computed; return it resolved."""
+def check_output(target: Path, *inputs: Path | str | None) -> Path:
+    """Refuse a place that cannot be written, before anything is computed; return it resolved.
+
+    Parameters
+    ----------
+    inputs : Path or str or None
+        What the command reads, as it was named; no file of these is replaced.
+    """
     if target.is_dir():
         raise Refused(f"{target} is a folder; name the file to write")
     if target.exists() and not target.is_file():
@@ -195,13 +201,16 @@ def check_output(target: Path) -> Path:
     target = target.resolve()
     if not target.parent.is_dir():
         raise Refused(f"the folder {target.parent} does not exist; make it first")
+    for each in inputs:
+        if each and target.exists() and Path(each).exists() and target.samefile(each):
+            raise Refused(f"{target} is an input of this command; name another file to write")
     return target
 
 
-def check_folder(folder: Path | None) -> None:
-    """Refuse a folder for a report that is a file."""
+def check_folder(folder: Path | None, option: str = "--report") -> None:
+    """Refuse a folder to write into that is a file."""
     if folder is not None and folder.exists() and not folder.is_dir():
-        raise Refused(f"--report {folder} is a file; name a folder")
+        raise Refused(f"{option} {folder} is a file; name a folder")
 
 
 def chosen_options(**given: Any) -> Options:

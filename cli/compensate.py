@@ -52,7 +52,7 @@ def compensate(
         raise Refused("give either -o OUT or --in-place")
     options = how.chosen(plate)
     check_input(source)
-    target = check_output(output or source)
+    target = check_output(output or source, machine)
     if output is not None and target.exists() and target.samefile(source):
         raise Refused(f"{output} is the input; name another file, or use --in-place instead of -o")
     check_folder(report)
@@ -63,19 +63,20 @@ def compensate(
         return
     found = _machine(machine)
 
-    from stillpath.cli.console import print_result, progress_shown
+    from stillpath.cli.console import print_result, progress_shown, told_after
     from stillpath.pipeline.compensate import compensate_file
+    from stillpath.service.interruption import interruptible
 
-    with progress_shown() as progress:
-        result = compensate_file(
-            source, target, found.machine, options, progress=progress, layers=report
-        )
-    result.warnings.extend(found.warnings)
-    try:
-        _write_report(result, report)
-    except OSError as error:  # the file is in its place, and right
-        result.warnings.append(f"no report: {error.filename}: {error.strerror}")
-    print_result(result)
+    with interruptible():  # a first signal that comes once the file is in its place has no effect
+        with progress_shown() as progress:
+            result = compensate_file(
+                source, target, found.machine, options, progress=progress, layers=report
+            )
+        result.warnings.extend(found.warnings)
+        with told_after(target, "report"):
+            _write_report(result, report)
+        with told_after(target, "figures"):
+            print_result(result)
 
 
 def simulate(

@@ -11,14 +11,23 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.table import Table
 
-from stillpath.service.interruption import interruptible
+from stillpath.service.interruption import Interrupted, interruptible
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from stillpath.pipeline.progress import Progress
     from stillpath.pipeline.result import AdviceFigures, BudgetFigures, PrintWay, Result
     from stillpath.pipeline.simulate import PlannedTime
 
-__all__ = ["budget_line", "print_planned", "print_result", "progress_shown", "shown"]
+__all__ = [
+    "budget_line",
+    "print_planned",
+    "print_result",
+    "progress_shown",
+    "shown",
+    "told_after",
+]
 
 _PLAIN_EVERY_S = 5.0
 
@@ -38,6 +47,28 @@ def progress_shown() -> Iterator[Callable[[Progress], None]]:
             told(progress)
 
         yield tell
+
+
+@contextmanager
+def told_after(target: Path, missing: str) -> Iterator[None]:
+    """Do what comes once the output is in its place: failing, it is a warning on stderr.
+
+    Parameters
+    ----------
+    missing : str
+        What there is not if it fails, such as "report".
+    """
+    try:
+        yield
+    except Interrupted:
+        why = "interrupted"
+    except OSError as error:
+        why = ": ".join(part for part in (error.filename, error.strerror) if part) or str(error)
+    except Exception as error:
+        why = f"{type(error).__name__}: {error}"
+    else:
+        return
+    sys.stderr.write(f"stillpath: warning: {target} is written; no {missing}: {why}\n")
 
 
 def print_result(result: Result) -> None:

@@ -93,11 +93,11 @@ class OutputOptions:
         Path | None, typer.Option("--c-header", metavar="FILE", help="The same as C.")
     ] = None
 
-    def check(self) -> None:
+    def check(self, *inputs: Path | str | None) -> None:
         """Refuse what cannot be written, before anything is computed."""
         for file in (self.json_file, self.c_header):
             if file is not None:
-                check_output(file)
+                check_output(file, *inputs)
         check_folder(self.report)
 
     def write(self, made: Designed) -> None:
@@ -128,8 +128,8 @@ def controller(
         return
     if machine is None:
         raise typer.BadParameter("--machine is missing; `stillpath loops` lists what there is")
+    output.check(options, machine, settings.nominal, settings.fast)
     chosen = _options(options, settings.given())
-    output.check()
 
     from stillpath.applications.controllers.design import design_controller
     from stillpath.cli.controller_tables import print_controller

@@ -178,7 +178,7 @@ def identify(
     """
     settings = readers.chosen(None if ripple.ripple else axis)
     if target.output is not None:
-        check_output(target.output)
+        check_output(target.output, *files, *(file.rpartition("@")[0] for file in files))
     check_folder(report)
     machines = open_machines()
     start, expected = _start(machines, target.machine, target.base)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
@@ -54,8 +55,7 @@ def create(
         key, secret = _store(engine).create(
             name=name, owner=owner, scopes=scopes, expires_at=expires_at
         )
-        _note(engine, "key.create", key)
-    typer.echo(secret)
+        _show(engine, key, secret)
     typer.echo(f"key {key.id} of {owner}; it cannot be shown again", err=True)
 
 
@@ -105,8 +105,7 @@ def first(data_dir: DataDir = None) -> None:
                 "there are keys already; `stillpath keys create NAME --owner OWNER --scope admin` "
                 "makes another"
             )
-        _note(engine, "key.create", store.find(secret))
-    typer.echo(secret)
+        _show(engine, store.find(secret), secret)
 
 
 def audit(
@@ -163,6 +162,25 @@ def _store(engine: Engine) -> Any:
     return KeyStore(engine)
 
 
+def _show(engine: Engine, key: Any, secret: str) -> None:
+    """Print a key; one that cannot be shown is withdrawn, as nobody could ever use it.
+
+    Raises
+    ------
+    OSError
+        Also where nobody reads any more.
+    """
+    _note(engine, "key.create", key)
+    out = sys.stdout.buffer  # `sys.stdout` swallows that its reader has gone
+    try:
+        out.write(f"{secret}\n".encode())
+        out.flush()
+    except OSError:
+        _store(engine).withdraw(key)
+        _note(engine, "key.withdraw", key)
+        raise
+
+
 def _note(engine: Engine, action: str, key: Any) -> None:
     """Write into the audit log what was done here, by whoever may read the database."""
     from stillpath.service.security.audit import AuditLog
@@ -188,8 +206,6 @@ def _moment(seconds: float | None) -> str:
 
 def _print_table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> None:
     """Print columns by tabs where a program reads, as a table on a terminal."""
-    import sys
-
     if not sys.stdout.isatty():
         for row in (head, *rows):
             typer.echo("\t".join(" ".join(cell.split()) for cell in row))

@@ -27,7 +27,7 @@ def export(
     ] = Path("stillpath.json"),
 ) -> None:
     """Write the machine's compensation for the extra of Klipper (docs/klipper-live.md)."""
-    target = check_output(output)
+    target = check_output(output, machine)
 
     from stillpath.cli.own_machines import open_machines
 

@@ -320,9 +320,22 @@ def delete(name: Name) -> None:
 
 
 @app.command()
-def restore(name: Name) -> None:
-    """Bring back the machine that was deleted last under a name."""
-    _print_revision(open_machines().store.restore(name))
+def restore(
+    name: Name,
+    number: Annotated[
+        int | None,
+        typer.Option(
+            "--number",
+            min=1,
+            help="Which one, if several were deleted: 1 is the first. [default: the last]",
+        ),
+    ] = None,
+) -> None:
+    """Bring back a machine that was deleted under a name."""
+    store = open_machines().store
+    _print_revision(store.restore(name, number))
+    for other, when in enumerate(store.trash(name), 1):
+        typer.echo(f"also in the trash: number {other}, deleted {when}")
 
 
 @app.command()
@@ -416,11 +429,11 @@ def from_m503(
     """Make a machine from Marlin's M503: limits and steps, with plants still to be measured."""
     from stillpath.applications.machines import marlin_settings
     from stillpath.applications.machines.revision import source_file
-    from stillpath.models.user_files import read_bytes
+    from stillpath.models.user_files import as_utf8, read_bytes
 
     content = read_bytes(file, _LARGEST_LOG_BYTES, "keep M503's answer only")
     machine = marlin_settings.machine_from_m503(
-        content.decode(errors="replace"),
+        as_utf8(content).decode(errors="replace"),
         file.name,
         _stated(made),
         travel_mm=marlin_settings.read_travel(travel),

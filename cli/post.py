@@ -19,8 +19,8 @@ def compensate_in_place(
     *,
     name: str,
     tell: Callable[[str, float | None], object],
-) -> str:
-    """Compensate a sliced file in place and return the page of its report.
+) -> Callable[[], str]:
+    """Compensate a sliced file in place and return what makes the page of its report.
 
     Parameters
     ----------
@@ -70,4 +70,5 @@ def compensate_in_place(
     except (GcodeError, ModelError, DesignError) as error:
         raise Refused(str(error)) from error
     result.warnings.extend(found.warnings)
-    return render_report(result.model_copy(update={"source_name": name}))
+    named = result.model_copy(update={"source_name": name})
+    return lambda: render_report(named)

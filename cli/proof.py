@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -72,6 +73,7 @@ def coupon(
 ) -> None:
     """Write a first print: half as planned, half compensated."""
     settings = how.chosen()
+    target = check_output(output, machine, how.start_gcode, how.end_gcode)
     found = open_machines().for_job(machine, files=True)
 
     from stillpath.applications.proof.coupon import write_coupon
@@ -79,7 +81,7 @@ def coupon(
     from stillpath.cli.proof_tables import print_proof
 
     with progress_shown() as progress:
-        made = write_coupon(found.machine, check_output(output), settings, progress=progress)
+        made = write_coupon(found.machine, target, settings, progress=progress)
     print_proof(made, found.warnings)
 
 
@@ -93,6 +95,7 @@ def tower(
 ) -> None:
     """Write a ringing tower: half as planned, half compensated."""
     settings = how.chosen()
+    target = check_output(output, machine, how.start_gcode, how.end_gcode)
     found = open_machines().for_job(machine, files=True)
 
     from stillpath.applications.proof.tower import write_tower
@@ -100,9 +103,7 @@ def tower(
     from stillpath.cli.proof_tables import print_proof, print_tower
 
     with progress_shown() as progress:
-        made = write_tower(
-            found.machine, axis, check_output(output), settings, count=bands, progress=progress
-        )
+        made = write_tower(found.machine, axis, target, settings, count=bands, progress=progress)
     print_proof(made.written, found.warnings, lines=3)
     print_tower(made)
 
@@ -120,6 +121,7 @@ def ring_test(
     start_gcode: StartGcode = None,
 ) -> None:
     """Write stops for an accelerometer, half as planned, half compensated. Nothing is printed."""
+    target = check_output(output, machine, start_gcode)
     found = open_machines().for_job(machine, files=True)
 
     from stillpath.applications.proof.recorders import RingSettings
@@ -129,7 +131,7 @@ def ring_test(
 
     settings = RingSettings(chip, chip_y, _text(start_gcode))
     with progress_shown() as progress:
-        made = write_ring_test(found.machine, check_output(output), settings, progress=progress)
+        made = write_ring_test(found.machine, target, settings, progress=progress)
     print_proof(made, found.warnings)
 
 
@@ -144,13 +146,16 @@ def motor_test(
 
     Then `stillpath machines motors NAME OUT CONSOLE` reads what the console said.
     """
+    target = check_output(output, machine)
     found = open_machines().for_job(machine, files=True)
 
     from stillpath.applications.proof.motor_test import levels_of
     from stillpath.applications.proof.motor_test import motor_test as written
+    from stillpath.pipeline.files import replacing
 
     text = written(found.machine, most)
-    check_output(output).write_text(text, encoding="utf-8")
+    with replacing(target) as temporary:
+        temporary.write_text(text, encoding="utf-8", newline="\n")
     for number, level in enumerate(levels_of(text), 1):
         accel, step = level.accel_mm_s2, level.speed_step_mm_s
         typer.echo(f"level {number}: {accel:.0f} mm/s2, steps of {step:.0f} mm/s")
@@ -262,6 +267,8 @@ def _text(file: Path | None) -> str | None:
 def _point(text: str) -> tuple[float, float]:
     try:
         x, y = (float(part) for part in text.split(","))
+        if not (math.isfinite(x) and math.isfinite(y)):
+            raise ValueError
     except ValueError:
         raise typer.BadParameter(f"--at {text}: two numbers are needed, as in 110,110") from None
     return x, y

@@ -53,8 +53,9 @@ def compensate_on_server(
     ------
     service.client.ClientError
     OSError
-        If the file or the report cannot be written, or the source was changed meanwhile.
+        If the file cannot be written, or the source was changed meanwhile.
     """
+    from stillpath.cli.console import told_after
     from stillpath.pipeline.files import check_unchanged
     from stillpath.service.interruption import interruptible_at_once
 
@@ -63,12 +64,14 @@ def compensate_on_server(
             began = source.stat()
             made = client.submit(source, machine=machine, options=options, tell=tell)
             job = client.result_of(made, tell=_reports(tell))
-            if report is not None:
-                client.save_report(job.id, report)
             figures = client.report(job.id)
-            check_unchanged(source, began)  # the target may be the source
-            client.fetch(job, target, tell=tell)
-        _print_figures(figures)
+            # The target may be the source.
+            client.fetch(job, target, tell=tell, check=lambda: check_unchanged(source, began))
+        if report is not None:
+            with told_after(target, "report"):
+                client.save_report(job.id, report)
+        with told_after(target, "figures"):
+            _print_figures(figures)
 
 
 @app.command("list")
@@ -134,6 +137,7 @@ def fetch(
     key: KeyOption = None,
 ) -> None:
     """Fetch the result of a job that is done."""
+    from stillpath.cli.console import told_after
     from stillpath.service.api.uploads import safe_name
     from stillpath.service.interruption import interruptible_at_once
 
@@ -144,7 +148,8 @@ def fetch(
             raise Refused(f"{target} exists; name the file with -o to replace it")
         with _progress() as tell:
             client.fetch(found, target, tell=tell)
-            if report is not None:
+        if report is not None:
+            with told_after(target, "report"):
                 client.save_report(found.id, report)
     sys.stdout.write(f"{target}\n")
 

@@ -99,9 +99,7 @@ def scan(
     """Make the command of a hatch file for a scanner. Every track is predicted."""
     if output.suffix not in (".csv", ".npz"):
         raise typer.BadParameter(f"{output}: the command is written as .csv or .npz")
-    if output.resolve() == source.resolve():
-        raise typer.BadParameter("OUT must not be IN")
-    check_output(output)
+    check_output(output, source, machine, controller, drawing.disturbance)
     check_folder(report)
 
     from stillpath.applications.controllers.loading import load_controller

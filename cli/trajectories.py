@@ -14,7 +14,6 @@ from stillpath.cli.arguments import (
     MachineOption,
     MethodOption,
     PlateOption,
-    Refused,
     RobustOption,
     check_input,
     check_output,
@@ -50,9 +49,7 @@ def trajectories(
     if chosen not in ("csv", "npz"):
         raise typer.BadParameter(f"--format {form}: choose csv or npz")
     check_input(source)
-    target = check_output(output)
-    if target.exists() and target.samefile(source):
-        raise Refused(f"{output} is IN; name the file to write")
+    target = check_output(output, source, machine)
     options = chosen_options(
         method=method, robust=robust, budget_um=budget_um, plate=plate, dialect=dialect
     )
@@ -88,9 +85,7 @@ def plan(
 ) -> None:
     """Write the motion the machine will make. Columns t (s), x, y, z, e (mm)."""
     check_input(source)
-    target = check_output(output)
-    if target == source.resolve():
-        raise Refused("OUT must not be IN: the motion is not G-code")
+    target = check_output(output, source, machine)
     read_as = chosen_options(dialect=dialect).dialect
     found = open_machines().for_job(machine, files=True)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-from codecs import BOM_UTF8
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
@@ -15,6 +14,7 @@ from stillpath.models.complaints import complaint
 from stillpath.models.errors import ModelError
 from stillpath.models.firmware import FIRMWARE_KINDS
 from stillpath.models.machine import Machine
+from stillpath.models.user_files import as_utf8
 
 __all__ = [
     "builtin_machines",
@@ -83,7 +83,7 @@ def read_machine(document: str | bytes, source: str = "machine") -> Machine:
     """
     try:
         content = document.encode() if isinstance(document, str) else document
-        parsed = from_json(content.removeprefix(BOM_UTF8))  # Windows' editors write it
+        parsed = from_json(as_utf8(content))
     except ValueError as error:
         raise ModelError(f"{source}: not JSON ({error})") from None
     try:

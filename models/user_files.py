@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from codecs import BOM_UTF8, BOM_UTF16_BE, BOM_UTF16_LE
 from pathlib import Path
 
 from stillpath.models.errors import ModelError
 
-__all__ = ["read_bytes"]
+__all__ = ["as_utf8", "read_bytes"]
 
 
 def read_bytes(path: Path, largest: int, otherwise: str) -> bytes:
@@ -30,3 +31,13 @@ def read_bytes(path: Path, largest: int, otherwise: str) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise ModelError(f"cannot read {path}: {error.strerror}") from None
+
+
+def as_utf8(content: bytes) -> bytes:
+    """Return text as UTF-8 without a byte order mark.
+
+    Editors of Windows write that mark, its PowerShell (``>``) and spreadsheets UTF-16 with one.
+    """
+    if content[:2] in (BOM_UTF16_LE, BOM_UTF16_BE):
+        return content.decode("utf-16", errors="replace").encode()
+    return content.removeprefix(BOM_UTF8)

@@ -214,7 +214,14 @@ class Client:
         detail = problem.get("detail") or f"the job was {job.state.value} on the server"
         raise ClientError(str(detail), int(problem.get("status", 409)), problem)
 
-    def fetch(self, job: JobView | str, target: Path | str, *, tell: Tell | None = None) -> Path:
+    def fetch(
+        self,
+        job: JobView | str,
+        target: Path | str,
+        *,
+        tell: Tell | None = None,
+        check: Callable[[], object] = lambda: None,
+    ) -> Path:
         """Write the result to a file, whole or not at all; what broke off is taken up again.
 
         Parameters
@@ -223,6 +230,9 @@ class Client:
             The job or its id.
         target : Path
         tell : callable, optional
+        check : callable, optional
+            Called when all is here, before the file takes its place; may raise to leave that as
+            it is.
 
         Raises
         ------
@@ -236,6 +246,7 @@ class Client:
         with replacing(target) as temporary:
             path = _path(job.id, "result")
             self._connection.download(path, temporary, tell, size_bytes=job.result_bytes)
+            check()
         return target
 
     def report(self, job_id: str) -> dict[str, Any]:

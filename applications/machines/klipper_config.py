@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, TypeAlias
 from stillpath.gcode.firmware.klipper.dialect import FOREIGN
 from stillpath.models.errors import ModelError
 from stillpath.models.firmware.klipper import shaper_type
-from stillpath.models.user_files import read_bytes
+from stillpath.models.user_files import as_utf8, read_bytes
 
 __all__ = [
     "Fact",
@@ -126,8 +126,8 @@ def read_printer_config(path: Path) -> PrinterConfig:
     ModelError
         If the file cannot be read or is no configuration.
     """
-    text = read_bytes(path, _LARGEST_BYTES, "not a printer.cfg").decode(errors="replace")
-    return parse_printer_config(text, path.name)
+    content = read_bytes(path, _LARGEST_BYTES, "not a printer.cfg")
+    return parse_printer_config(as_utf8(content).decode(errors="replace"), path.name)
 
 
 def parse_printer_config(text: str, name: str) -> PrinterConfig:

@@ -248,7 +248,7 @@ class MachineStore:
         try:
             self._documents.create_folder(name, contents)
         except FileExistsError:
-            raise _exists(name) from None
+            raise _exists(name, "take another name (--as)") from None
 
     def delete(self, name: str) -> None:
         """Move a machine with its history to the trash; `restore` brings it back."""
@@ -259,25 +259,42 @@ class MachineStore:
         except FileNotFoundError:
             raise _no_machine(name) from None
 
-    def restore(self, name: str) -> Revision:
-        """Bring the machine that was deleted last under this name back.
+    def trash(self, name: str) -> list[str]:
+        """Return when machines of this name in the trash were deleted (UTC), oldest first."""
+        check_name(name)
+        return self._documents.folders(f"{_TRASH}/{name}")
+
+    def restore(self, name: str, number: int | None = None) -> Revision:
+        """Bring a machine that was deleted under this name back.
+
+        Parameters
+        ----------
+        number : int, optional
+            Which one of `trash`, from 1; the last by default.
 
         Raises
         ------
         Conflict
             If there is a machine of that name again.
         """
-        check_name(name)
-        trash = f"{_TRASH}/{name}"
-        found = self._documents.folders(trash)
+        found = self.trash(name)
         if not found:
             raise UnknownMachine(
                 f"no machine {name!r} is in the trash {self._documents.place(_TRASH)}"
             )
+        number = len(found) if number is None else number
+        if not 1 <= number <= len(found):
+            times = ", ".join(f"{n} (deleted {when})" for n, when in enumerate(found, 1))
+            raise UnknownMachine(f"no machine {name!r} number {number} is in the trash: {times}")
         try:
-            self._documents.move(f"{trash}/{found[-1]}", name)
+            self._documents.move(f"{_TRASH}/{name}/{found[number - 1]}", name)
         except FileExistsError:
-            raise _exists(name) from None
+            # Deleted, it becomes the last one: the numbers of the others stay.
+            raise Conflict(
+                f"there is a machine {name!r} already; delete that one "
+                f"(`stillpath machines delete {name}`, which can be undone), then bring this one "
+                f"back: `stillpath machines restore {name} --number {number}`"
+            ) from None
         return self.current(name)
 
     # Private
@@ -428,10 +445,10 @@ def _no_machine(name: str) -> UnknownMachine:
     )
 
 
-def _exists(name: str) -> Conflict:
+def _exists(name: str, remedy: str = "take another name") -> Conflict:
     return Conflict(
-        f"there is a machine {name!r} already; take another name (--as), or delete that one "
-        f"first (`stillpath machines delete {name}`, which can be undone)"
+        f"there is a machine {name!r} already; {remedy}, or delete that one first "
+        f"(`stillpath machines delete {name}`, which can be undone)"
     )
 
 

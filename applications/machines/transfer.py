@@ -22,7 +22,7 @@ from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
 from stillpath.models.provenance import SourceFile
 from stillpath.models.store import explain, read_machine
-from stillpath.models.user_files import read_bytes
+from stillpath.models.user_files import as_utf8, read_bytes
 
 __all__ = ["export_history", "import_file", "with_firmware_file"]
 
@@ -105,11 +105,11 @@ def with_firmware_file(machine: Machine, file: Path) -> tuple[Machine, SourceFil
         Naming the first field of the section that is wrong.
     """
     content = read_bytes(file, _LARGEST_BYTES, "neither machine nor history")
-    text = content.decode(errors="replace")
+    text = as_utf8(content).decode(errors="replace")
     if looks_like_m503(text):
         return with_m503(machine, text, file.name), source_file(file.name, content)
     try:
-        section = from_json(content)
+        section = from_json(as_utf8(content))
     except ValueError as error:
         raise ModelError(
             f"{file}: neither a section as JSON ({error}) nor an answer to M503, which has M92 and "
@@ -127,7 +127,7 @@ def with_firmware_file(machine: Machine, file: Path) -> tuple[Machine, SourceFil
 def _as_history(content: bytes, file: Path) -> _History | None:
     """Return the history in a file, None if it is something else."""
     try:
-        document = from_json(content)
+        document = from_json(as_utf8(content))
     except ValueError:
         return None
     if not isinstance(document, dict) or "revisions" not in document:

@@ -264,7 +264,9 @@ def _machine(spec: LoopSpec) -> tuple[object, object]:
 
 
 def _scale(spec: LoopSpec, settings: ScanSettings) -> float:
-    scale = settings.um_per_unit or {"mm": 1e3, "um": 1.0, "µm": 1.0}.get(spec.unit)
+    scale = settings.um_per_unit
+    if scale is None:
+        scale = {"mm": 1e3, "um": 1.0, "µm": 1.0}.get(spec.unit)
     if scale is None:
         raise DesignError(
             f"the machine's unit is {spec.unit!r}: say how far the beam moves per {spec.unit} "

@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from stillpath.cli.arguments import CompensationOptions, KeyOption, ServerOption
+from stillpath.cli.arguments import CompensationOptions, KeyOption, ServerOption, check_folder
 
 if TYPE_CHECKING:
+    from stillpath.cli.batch.items import Group
     from stillpath.cli.batch.output import Outcome, OutputFolder
     from stillpath.cli.batch.worker_pool import WorkerPool
     from stillpath.pipeline.options import Options
@@ -75,7 +76,8 @@ def batch(
     from stillpath.service.interruption import Interrupted
 
     options = how.chosen()
-    items = items_of(sources, parse_map(work.machine, work.machine_map or []), output=output)
+    group = parse_map(work.machine, work.machine_map or [])
+    items = items_of(sources, group, output=output)
     outcomes: list[Outcome] = []
 
     def tell(outcome: Outcome) -> None:
@@ -83,7 +85,7 @@ def batch(
         _line(outcome, f"{len(outcomes)} of {len(items)}")
 
     try:
-        with _at_work(output, options, work) as (worker_pool, folder, check):
+        with _at_work(output, group, options, work) as (worker_pool, folder, check):
             outcomes = run_batch(worker_pool, folder, items, tell=tell, check=check)
             write_summary(outcomes, output)
     except Interrupted as interruption:
@@ -126,7 +128,7 @@ def watch(
     options = how.chosen()
     group = parse_map(work.machine, work.machine_map or [])
     check_apart(folder, output)
-    with _at_work(output, options, work) as (worker_pool, kept, check):
+    with _at_work(output, group, options, work) as (worker_pool, kept, check):
         watcher = Watcher(folder, group, worker_pool, kept, settle_s=settle_s, tell=_line)
         sys.stderr.write(f"stillpath: watching {folder}\n")
         try:
@@ -137,18 +139,22 @@ def watch(
 
 @contextmanager
 def _at_work(
-    output: Path, options: Options, asked: WorkOptions
+    output: Path, group: Group, options: Options, asked: WorkOptions
 ) -> Iterator[tuple[WorkerPool, OutputFolder, Any]]:
     """Yield a worker pool, its output folder, and a check to call now and then."""
+    from stillpath.cli.batch.items import check_names
     from stillpath.cli.batch.output import OutputFolder
     from stillpath.cli.batch.worker_pool import LocalPool, Workplace, worker_pool
     from stillpath.cli.own_machines import open_machines
     from stillpath.service.interruption import interruptible
 
+    check_folder(output, "--output")
     works: Workplace
     if not asked.server:
         jobs = asked.jobs or os.cpu_count() or 1
-        works = LocalPool(open_machines(), options, jobs)
+        machines = open_machines()
+        check_names(group, machines)
+        works = LocalPool(machines, options, jobs)
     else:
         from stillpath.cli.batch.server import ServerWorkplace, batch_name
         from stillpath.service.client import Client, ClientError

@@ -4,17 +4,24 @@ from __future__ import annotations
 
 import fnmatch
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from stillpath.cli.arguments import check_input
 from stillpath.models.errors import ModelError
 from stillpath.pipeline.files import result_name
+
+if TYPE_CHECKING:
+    from stillpath.applications.machines.resolve import Resolver
 
 __all__ = [
     "Group",
     "Item",
     "check_apart",
+    "check_names",
     "is_stamped",
     "items_of",
     "parse_map",
@@ -101,7 +108,8 @@ def items_of(sources: Sequence[Path], group: Group, *, output: Path) -> list[Ite
 
     Raises
     ------
-    FileNotFoundError
+    Refused
+        A source does not exist, or is a pipe or a device.
     ModelError
         Two files would have the same result, or a folder lies in the output folder.
     """
@@ -109,11 +117,12 @@ def items_of(sources: Sequence[Path], group: Group, *, output: Path) -> list[Ite
     places: dict[str, Path] = {}
     seen: set[Path] = set()
     for source in sources:
-        if not source.exists():
-            raise FileNotFoundError(2, "there is no such file or folder", str(source))
+        found: Iterable[tuple[Path, str]] = [(source, source.name)]
         if source.is_dir():
             check_apart(source, output)
-        found = _below(source, output) if source.is_dir() else [(source, source.name)]
+            found = _below(source, output)
+        else:
+            check_input(source)
         for path, place in found:
             if path.resolve() in seen:
                 continue
@@ -140,6 +149,29 @@ def check_apart(folder: Path, output: Path) -> None:
             f"--output {output} is or holds the folder {folder}, and what lies in the output "
             "folder is passed over; name an output folder in it or elsewhere"
         )
+
+
+def check_names(group: Group, machines: Resolver) -> None:
+    """Refuse two machines of one name for a file: their results would lie in one place.
+
+    A machine that cannot be used is passed over; each of its files says why.
+
+    Raises
+    ------
+    ModelError
+    """
+    for chosen in (group.machines, *(machines for _, machines in group.map)):
+        called: dict[str, str] = {}
+        for given in chosen:
+            with suppress(ModelError):
+                called[given] = machines.for_job(given, files=True).machine.name
+        for given, name in called.items():
+            other = next(first for first in called if called[first] == name)
+            if other != given:
+                raise ModelError(
+                    f"{other} and {given} are both called {name!r}, and results lie in folders "
+                    'of that name: give one of the documents another "name"'
+                )
 
 
 def _is_print_file(path: Path) -> bool:

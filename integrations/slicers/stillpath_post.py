@@ -125,13 +125,16 @@ def _process(settings: Settings, voice: Voice, signals: Signals) -> None:
         page = _on_server(path, options, settings, voice)
     else:
         page = _here(path, options, voice, signals)
+    # The file is replaced: from here on nothing fails.
     voice.note(f"{job.name} compensated in {time.monotonic() - began:.1f} s")
     if settings.report and page:
         _write_report(page, job, settings, voice)
 
 
-def _here(path: Path, options: dict[str, Any], voice: Voice, signals: Signals) -> bytes:
-    """Compensate on this computer; heavy imports begin here."""
+def _here(
+    path: Path, options: dict[str, Any], voice: Voice, signals: Signals
+) -> Callable[[], bytes]:
+    """Compensate on this computer, and return what makes the report; heavy imports begin here."""
     try:
         from stillpath.cli import post
     except ImportError:
@@ -153,11 +156,13 @@ def _here(path: Path, options: dict[str, Any], voice: Voice, signals: Signals) -
         raise Failure(error) from None
     finally:
         signals.deferred = False
-    return page.encode()
+    return lambda: page().encode()
 
 
-def _on_server(path: Path, options: dict[str, Any], settings: Settings, voice: Voice) -> bytes:
-    """Let a server compensate, and replace the file."""
+def _on_server(
+    path: Path, options: dict[str, Any], settings: Settings, voice: Voice
+) -> Callable[[], bytes] | None:
+    """Let a server compensate, replace the file, and return what gives the report, if there is."""
     before = path.stat()
     client = Service(
         settings.server,
@@ -177,7 +182,7 @@ def _on_server(path: Path, options: dict[str, Any], settings: Settings, voice: V
             now = path.stat()
             if (now.st_size, now.st_mtime_ns) != (before.st_size, before.st_mtime_ns):
                 raise Failure(f"{path} was changed by somebody else while it was processed", 1)
-    return page
+    return (lambda: page) if page else None
 
 
 def _delete_leftovers(folder: Path, pattern: str, left_s: float) -> None:
@@ -191,16 +196,24 @@ def _delete_leftovers(folder: Path, pattern: str, left_s: float) -> None:
                     left.unlink()
 
 
-def _write_report(page: bytes, job: PrintJob, settings: Settings, voice: Voice) -> None:
+def _write_report(
+    page: Callable[[], bytes], job: PrintJob, settings: Settings, voice: Voice
+) -> None:
+    """Write the report, or say why there is none: the print is right all the same."""
     folder = job.folder or settings.reports
     target = folder / f"{job.stem}.stillpath.html"
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with replacing(target) as temporary:
-            temporary.write_bytes(page)
+            temporary.write_bytes(page())
         voice.note(f"report: {target}")
-    except OSError as error:  # the print is right all the same
+    except OSError as error:
         voice.fail(f"warning: no report: {_of_system(error)}")
+    except (Stopped, KeyboardInterrupt):
+        voice.fail("warning: no report: interrupted; the file is compensated")
+    except Exception as error:
+        voice.fail(f"warning: no report: a bug of Stillpath: {type(error).__name__}: {error}")
+        voice.trace(traceback.format_exc())
 
 
 @contextlib.contextmanager
@@ -250,9 +263,10 @@ class PrintJob:
         local = self.host == "File" and not output.name.startswith(".") and output.parent.is_dir()
         self.folder = output.parent if local else None
         name = output.name[: -len(".pp")] if output.name.endswith(".pp") else output.name
-        self.name = name.lstrip(".") or "print.gcode"
-        ending = next((end for end in _SUFFIXES if self.name.lower().endswith(end)), "")
-        self.stem = self.name[: len(self.name) - len(ending)] or "print"
+        name = name.lstrip(".") or "print.gcode"
+        ending = next((end for end in _SUFFIXES if name.lower().endswith(end)), "")
+        self.stem = name[: len(name) - len(ending)] or "print"
+        self.name = name.encode("utf-8", "replace").decode()  # file systems know more than text
 
 
 class Settings:

@@ -75,7 +75,7 @@ def load_printers(path: Path | None) -> dict[str, Printer]:
     if path is None:
         return {}
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
+        content = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError) as error:
         raise PrinterFileError(f"{path} (STILLPATH_PRINTERS) cannot be read: {error}") from error
     sections = content.pop("printer", {})

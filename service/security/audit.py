@@ -43,7 +43,7 @@ class AuditEntry:
         Address of the other side.
     action : str
         For instance ``submit``, ``cancel``, ``delete``, ``machine.change``, ``printer.accept``,
-        ``key.revoke``, ``denied``.
+        ``key.revoke``, ``key.withdraw`` (it could not be shown), ``denied``.
     subject : str or None
         What it was done to: the id of a job or key, the name of a machine, a route.
     details : dict

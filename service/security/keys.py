@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pydantic import SecretStr
-from sqlalchemy import Engine, RowMapping, insert, select, update
+from sqlalchemy import Engine, RowMapping, delete, insert, select, update
 from sqlalchemy.exc import IntegrityError
 
 from stillpath.service.database.engine import reading, writing
@@ -190,6 +190,11 @@ class KeyStore:
             )
             row = connection.execute(select(keys).where(keys.c.id == key_id)).mappings().first()
         return None if row is None else _key(row)
+
+    def withdraw(self, key: Key) -> None:
+        """Delete a key that nobody has seen, as if it had not been made."""
+        with writing(self._engine) as connection:
+            connection.execute(delete(keys).where(keys.c.id == key.id))
 
     def _add(
         self,

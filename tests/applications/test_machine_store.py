@@ -180,13 +180,18 @@ def test_delete_can_be_undone(any_store: MachineStore):
     assert (any_store.history("mine"), any_store.approvals("mine")) == (history, approvals)
 
 
-def test_the_last_one_deleted_comes_back(any_store: MachineStore):
+def test_what_was_deleted_comes_back_the_last_one_first(any_store: MachineStore):
     for author in ("anna", "bob"):
         any_store.add_revision("mine", make_machine(), author=author)
         any_store.delete("mine")
     assert any_store.restore("mine").author == "bob"
-    with pytest.raises(Conflict, match="already"):
+    with pytest.raises(Conflict, match=r"already; .*delete mine.*restore mine --number 1`"):
         any_store.restore("mine")
+    any_store.delete("mine")
+    assert any_store.restore("mine", 1).author == "anna"
+    assert len(any_store.trash("mine")) == 1
+    with pytest.raises(UnknownMachine, match=r"number 2 is in the trash: 1 \(deleted 2"):
+        any_store.restore("mine", 2)
     with pytest.raises(UnknownMachine, match="trash"):
         any_store.restore("other")
 

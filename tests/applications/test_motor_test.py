@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import os
+import subprocess
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
@@ -15,6 +17,7 @@ from stillpath.models.errors import ModelError
 from stillpath.models.store import load_machine
 from tests.gcode.cutting import ender3_with
 from tests.gcode.plain_reader import read
+from tests.service.jobs.site import STILLPATH
 
 
 def console(*counts: tuple[int, int]) -> str:
@@ -144,6 +147,16 @@ def test_from_the_search_to_the_machine(
     said.write_text(console((5, 5), (5, 50), (5, 50), (5, 50), (5, 50)))
     assert run(["machines", "motors", "mine", str(written), str(said)]) == 2
     assert "lost at the printer's own limits" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(os.name != "posix", reason="limits the size of files")
+def test_a_full_disk_leaves_no_half_of_it(tmp_path: Path) -> None:
+    """Limits would be raised and never restored."""
+    command = [*STILLPATH, "motor-test", "-m", "ender3", "-o", str(tmp_path / "motors.gcode")]
+    limited = ["sh", "-c", 'ulimit -f 4; exec "$@"', "sh", *command]
+    ran = subprocess.run(limited, capture_output=True, text=True, check=False)
+    assert (ran.returncode, "motors.gcode: File too large" in ran.stderr) == (1, True)
+    assert list(tmp_path.iterdir()) == []
 
 
 def machine_file(folder: Path) -> Path:

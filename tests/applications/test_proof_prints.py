@@ -289,5 +289,6 @@ def test_the_command_line(tmp_path, capsys):
     assert "compensated:" in capsys.readouterr().out
     assert out.stat().st_size > 100_000
     assert run(["tower", "-m", "ender3", "--axis", "z", "-o", str(out)]) == 2
-    assert run(["coupon", "-m", "ender3", "-o", str(out), "--at", "7"]) == 2
+    for place in ("7", "nan,nan", "inf,7"):
+        assert run(["coupon", "-m", "ender3", "-o", str(out), "--at", place]) == 2
     assert run(["verify", str(out), str(tmp_path / "none.csv"), "-m", "ender3"]) == 2

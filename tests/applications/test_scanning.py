@@ -131,6 +131,8 @@ def test_refusals() -> None:
     spec = load_loop("galvo-10khz")
     with pytest.raises(DesignError, match="--um-per-unit"):
         scan_file(EXAMPLE, spec, ScanSettings())
+    with pytest.raises(DesignError, match="must be above 0"):
+        scan_file(EXAMPLE, spec, ScanSettings(0.0))
     with pytest.raises(DesignError, match="'galvo-40khz', not"):
         scan_file(EXAMPLE, spec, SCALED, add_on("galvo-40khz"))
     with pytest.raises(DesignError, match="zpetc"):

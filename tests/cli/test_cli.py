@@ -5,9 +5,12 @@ from __future__ import annotations
 import errno
 import os
 import re
+import signal
 import subprocess
 import sys
+import time
 import types
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -163,6 +166,31 @@ def test_bad_requests(pipeline, source, tmp_path, capsys, arguments, words):
         assert word in message
     assert source.read_bytes() == TEXT
     assert sorted(tmp_path.iterdir()) == [source]
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "compensate {source} -m {file} -o {file}",
+        "remove-advice {file} -o {file}",
+        "trajectories {file} -m ender3 -o {file}",
+        "identify {file} -o {file}",
+        "identify {file}@z=150 -o {file}",
+        "coupon -m ender3 --start-gcode {file} -o {file}",
+        "tower -m ender3 --axis x --end-gcode {file} -o {file}",
+        "ring-test -m {file} -o {file}",
+        "motor-test -m {file} -o {file}",
+        "klipper export -m {file} -o {file}",
+        "controller -m nrr --options {file} --json {file}",
+        "scan {source} -m galvo --disturbance {file} -o {file}",
+    ],
+)
+def test_no_input_is_an_output(source, tmp_path, capsys, command):
+    file = tmp_path / "mine.csv"
+    file.write_text("measured")
+    assert run(command.format(source=source, file=file).split()) == 2
+    assert f"{file} is an input of this command" in one_line(capsys)
+    assert file.read_text() == "measured"
 
 
 @pytest.mark.parametrize("name", ["missing.gcode", "."])
@@ -346,8 +374,48 @@ def test_a_report_that_cannot_be_written_is_a_warning(pipeline, source, tmp_path
     folder = tmp_path / "report"
     pipeline.behave = lambda: (folder / "report.json").mkdir(parents=True)
     assert compensate(source, "--in-place", "-m", "ender3", "--report", str(folder)) == 0
-    assert "warning: no report: " in capsys.readouterr().out
+    assert f"warning: {source} is written; no report: " in capsys.readouterr().err
     assert source.read_bytes().startswith(b"; compensated")
+
+
+def killed(times: int) -> None:
+    for _ in range(times):
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0)  # handlers run between two instructions
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="sends signals as POSIX does")
+@pytest.mark.parametrize(
+    ("behave", "words"),
+    [
+        (lambda: {}["key"], "no report: KeyError: 'key'"),
+        (lambda: killed(1), ""),  # it is done in a moment
+        (lambda: killed(2), "no report: interrupted"),
+    ],
+)
+def test_once_the_file_is_in_its_place_nothing_is_an_error(
+    pipeline, source, tmp_path, capsys, monkeypatch, behave, words
+):
+    target = tmp_path / "out.gcode"
+    monkeypatch.setattr("stillpath.reports.write_report", lambda *_: behave())
+    report = ["--report", str(tmp_path / "report")]
+    assert compensate(source, "-o", str(target), "-m", "ender3", *report) == 0
+    said = capsys.readouterr()
+    assert said.err == (f"stillpath: warning: {target} is written; {words}\n" if words else "")
+    assert "contour rms, extruding" in said.out
+    assert target.exists()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is full")
+def test_figures_that_cannot_be_shown_are_a_warning(
+    pipeline, source, tmp_path, monkeypatch, capsys
+):
+    full = Path("/dev/full").open("w", buffering=1)  # noqa: SIM115 - closing it fails, too
+    monkeypatch.setattr(sys, "stdout", full)
+    assert compensate(source, "-o", str(tmp_path / "out.gcode"), "-m", "ender3") == 0
+    with suppress(OSError):
+        full.close()
+    assert "is written; no figures: No space left on device" in capsys.readouterr().err
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="makes symbolic links")

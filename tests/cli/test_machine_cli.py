@@ -125,7 +125,11 @@ def test_a_machine_through_its_life(store: MachineStore, tmp_path: Path, capsys)
     assert machines() == 0
     assert "mine" in capsys.readouterr().out
     assert machines("delete", "mine") == 0
-    assert machines("restore", "mine") == 0
+    assert machines("import", file) == 0
+    assert machines("delete", "mine") == 0
+    capsys.readouterr()
+    assert machines("restore", "mine", "--number", 1) == 0
+    assert "also in the trash: number 1, deleted " in capsys.readouterr().out
     assert store.current("mine").number == 3
     assert store.current("mine").restored == 1
 
@@ -148,6 +152,25 @@ def test_export_and_import(store: MachineStore, tmp_path: Path, capsys):
     assert machines("delete", "mine") == 0
     assert machines("import", history) == 0
     assert store.history("mine") == before
+
+
+def test_what_the_shell_of_windows_writes(store: MachineStore, tmp_path: Path, capsys):
+    """PowerShell's `>` writes UTF-16 with a byte order mark."""
+    store.add_revision("mine", make_machine(), author="anna")
+    file = tmp_path / "written.json"
+    for command, *arguments in (
+        ("export", "mine", "-o", file),
+        ("export", "mine", "-o", file, "--history"),
+    ):
+        assert machines(command, *arguments) == 0
+        file.write_text(file.read_text(), encoding="utf-16")
+        assert machines("import", file, "--as", f"copy{len(arguments)}") == 0
+    firmware = tmp_path / "firmware.json"
+    firmware.write_text(make_machine().firmware.model_dump_json(), encoding="utf-16")
+    assert machines("set-firmware", "mine", firmware) == 0
+    firmware.write_text("echo: M92 X80 Y80 Z400 E93\necho: M203 X500 Y500 Z5 E25\n", "utf-16")
+    assert machines("from-m503", firmware, "--name", "new", "--travel", "200x200x200") == 2
+    assert "M201" in one_line(capsys)
 
 
 @pytest.mark.parametrize(
@@ -196,7 +219,7 @@ def test_bad_settings_are_refused(monkeypatch: pytest.MonkeyPatch, capsys):
 # Klipper's configuration
 
 
-@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
 def test_indentation_counts_as_in_configparser(tmp_path: Path, encoding: str):
     file = tmp_path / "printer.cfg"
     file.write_text(

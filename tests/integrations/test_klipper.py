@@ -219,6 +219,17 @@ def test_check_is_content():
     assert limits(printer) == ((300.0, 5000.0, 5.0, 0.5), 57.8)
 
 
+@pytest.mark.parametrize("state", ["printing", "standby"])  # from the printer's card, by OctoPrint
+def test_a_start_macro_stops_for_limits_of_a_stretch_only(state: str):
+    printer = in_stretch(OURS)
+    printer.state = state
+    with pytest.raises(CommandError, match="limits of a compensated stretch are still in force"):
+        printer.run("STILLPATH_CHECK STOP=1")
+    printer.run("STILLPATH_RESTORE")
+    printer.run("SET_VELOCITY_LIMIT ACCEL=1500")  # of the slicer
+    printer.run("STILLPATH_CHECK STOP=1")
+
+
 def test_check_shows_whether_the_shaper_goes_off():
     printer = Klipper(macros_of(OURS))
     printer.run("SET_VELOCITY_LIMIT ACCEL=9000")

@@ -111,15 +111,29 @@ def test_limits_bring_the_plan_back(
     assert np.abs(off).max() < 1.1
 
 
+@pytest.mark.parametrize(
+    ("name", "bears"),
+    [
+        ("ender3", {}),
+        # Its streams have a limit of 14142 mm/s2, every way the same.
+        ("voron-v24-250", {"motors": {"accel_mm_s2": 20_000.0}}),
+    ],
+)
 def test_a_compensated_file_is_not_compensated_twice(
-    klipper_live: Path, export: Callable[[str], dict[str, Any]], tmp_path: Path
+    name: str,
+    bears: dict[str, Any],
+    klipper_live: Path,
+    export: Callable[[str], dict[str, Any]],
+    tmp_path: Path,
 ) -> None:
-    machine = homed(load_machine("ender3"))
+    document = load_machine(name).model_dump()
+    document["command"] |= bears
+    machine = homed(Machine.model_validate(document))
     (tmp_path / "in.gcode").write_text(two_objects())
     made = tmp_path / "out.gcode"
     compensate_file(tmp_path / "in.gcode", made, machine, Options(robust="off"))
     more = f"[force_move]\nenable_force_move: True\n{USERS}\n{MACROS}"
-    prints = both(made.read_text(), machine, export("ender3"), tmp_path, klipper_live, more)
+    prints = both(made.read_text(), machine, export(name), tmp_path, klipper_live, more)
     # It stands aside for SET_INPUT_SHAPER, so that there the head stands a little longer.
     wanted = stands(prints.plain)
     assert [place for place in stands(prints.live) if place in wanted] == wanted

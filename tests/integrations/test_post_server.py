@@ -385,6 +385,32 @@ def test_a_report_that_cannot_be_written_stops_nothing(
     assert part.read_bytes() == DONE
 
 
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (stillpath_post.Stopped(15), "interrupted; the file is compensated"),
+        (KeyError("x"), "a bug"),
+    ],
+)
+def test_a_report_that_cannot_be_made_stops_nothing(
+    part: Path, tmp_path: Path, monkeypatch, capsys, error: BaseException, words: str
+):
+    """The file is replaced by then: "the file is as it was" would be wrong."""
+
+    def page() -> str:
+        raise error
+
+    def compensate_in_place(path: Path, *_: object, **__: object) -> object:
+        path.write_bytes(DONE)
+        return page
+
+    monkeypatch.setattr("stillpath.cli.post.compensate_in_place", compensate_in_place)
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    assert stillpath_post.main(["--local", "--machine", "ender3", str(part)]) == 0
+    assert f"stillpath-post: warning: no report: {words}" in capsys.readouterr().err
+    assert part.read_bytes() == DONE
+
+
 @pytest.mark.slow
 def test_progress_goes_to_stdout_while_the_server_is_busy(
     running: Running, part: Path, tmp_path: Path, monkeypatch, capsys

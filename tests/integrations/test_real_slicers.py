@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 import signal
@@ -51,6 +52,17 @@ def test_every_kind_of_file(tmp_path: Path, name: str, content: bytes, begins: b
     assert again.returncode == 2
     assert re.match(r"stillpath-post: line \d+: this file was already processed", again.stderr)
     assert path.read_bytes() == made
+
+
+@pytest.mark.skipif(os.name != "posix" or sys.platform == "darwin", reason="names are text there")
+def test_a_name_that_is_not_text(tmp_path: Path):
+    path = tmp_path / os.fsdecode(b"pi\xe8ce.gcode")
+    path.write_bytes(TEXT)
+    done = post("--machine", "ender3", path, home=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert STAMP in path.read_bytes()
+    report = path.with_name(os.fsdecode(b"pi\xe8ce.stillpath.html"))
+    assert "pi?ce.gcode" in report.read_text()
 
 
 def test_what_cannot_be_done_here(tmp_path: Path):

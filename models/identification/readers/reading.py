@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import codecs
 import re
 from pathlib import Path
 
@@ -23,14 +22,13 @@ from stillpath.models.identification.readers.shaketune import is_shaketune, read
 from stillpath.models.identification.readers.spectra import MOST_BINS, is_spectrum, read_spectrum
 from stillpath.models.identification.readers.tables import Table, as_table, check_size
 from stillpath.models.identification.types import Measurement
+from stillpath.models.user_files import as_utf8
 
 __all__ = ["LARGEST_BYTES", "read_content", "read_measurements"]
 
 LARGEST_BYTES = 200_000_000
 _LARGEST_MODEL_BYTES = 16_000_000
 _HEAD_BYTES = 16_384
-_UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
-"""What spreadsheets call Unicode text."""
 
 _DIRECTION = r"-?\d+\.\d+,-?\d+\.\d+(?:,-?\d+\.\d+)?"
 _KLIPPER_NAME = re.compile(
@@ -80,8 +78,7 @@ def read_content(
     """Read the content of a file called `name`; see `read_measurements`."""
     settings = settings or ReadSettings()
     content = unpacked(content, name, LARGEST_BYTES)
-    if content[:2] in _UTF16:
-        content = content.decode("utf-16", errors="replace").encode()
+    content = as_utf8(content)
     if not content.strip():
         raise ModelError(f"{name}: the file is empty")
     named = _axes_in_name(name)

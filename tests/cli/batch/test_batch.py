@@ -115,10 +115,25 @@ def test_names_stay_names():
 def test_usage(capsys):
     fill(a="G28")
     assert run(["batch", "in", "-o", "out"]) == 2
-    assert run(["batch", "gone", "-m", "ender3", "-o", "out"]) == 1
+    assert run(["batch", "gone", "-m", "ender3", "-o", "out"]) == 2
+    assert run(["batch", "in", "-m", "ender3", "-o", "in/a.gcode"]) == 2
     assert batch("--method", "magic") == 2
     assert "method" in capsys.readouterr().err
     assert not Path("out").exists()
+
+
+def test_two_machines_of_one_name_are_refused(capsys):
+    """Their results would lie over each other."""
+    fill(a="G28")
+    Path("copy.json").write_text(make_machine("ender3").model_dump_json())
+    assert batch("--machine", "voron-v0,ender3,copy.json") == 2
+    assert "ender3 and copy.json are both called 'ender3'" in capsys.readouterr().err
+    assert batch("--machine-map", "b*=copy.json,ender3") == 2
+    watch = ["watch", "in", "--machine", "copy.json,ender3", "-o", "out"]
+    assert run(watch) == 2
+    assert "copy.json and ender3 are both called" in capsys.readouterr().err
+    assert not Path("out").exists()
+    assert batch("--machine", "ender3", "--machine-map", "b*=copy.json") == 0  # of other files
 
 
 def test_an_unknown_machine_fails_each_file():

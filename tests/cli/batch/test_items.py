@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from pathlib import Path
 
 import pytest
 
+from stillpath.cli.arguments import Refused
 from stillpath.cli.batch.items import Group, items_of, parse_map, result_name
 from stillpath.models.errors import ModelError
 
@@ -51,8 +54,15 @@ def test_a_folder_within_the_output_is_refused(tmp_path, output):
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"nothing\.gcode"):
+    with pytest.raises(Refused, match=r"nothing\.gcode does not exist"):
         items_of([tmp_path / "nothing.gcode"], Group(("m",)), output=tmp_path / "out")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="makes a named pipe")
+def test_pipes_are_refused(tmp_path):
+    os.mkfifo(tmp_path / "pipe.gcode")
+    with pytest.raises(Refused, match="is a pipe or a device"):
+        items_of([tmp_path / "pipe.gcode"], Group(("m",)), output=tmp_path / "out")
 
 
 def test_machines_by_pattern():

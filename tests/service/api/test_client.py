@@ -21,6 +21,7 @@ import pytest
 from stillpath.cli import main
 from stillpath.service.api.schemas import JobView
 from stillpath.service.client import Client, ClientError
+from stillpath.service.connection import Connection
 from tests.integrations.breaking import BODY, TAKES_S, breaking_server
 from tests.service.jobs.site import STILLPATH
 from tests.service.test_server import PRETEND, ROOT, server, until
@@ -366,7 +367,12 @@ def test_compensate_with_a_server(address: str, run: Callable[..., Any], tmp_pat
     assert (code, "http://127" in err) == (2, True)
 
 
+@pytest.mark.parametrize(
+    ("kind", "step"), [(Client, "result_of"), (Connection, "download")], ids=["at work", "fetched"]
+)
 def test_a_file_that_somebody_changes_while_a_server_works(
+    kind: type,
+    step: str,
     address: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -374,18 +380,29 @@ def test_a_file_that_somebody_changes_while_a_server_works(
 ):
     """Sliced again meanwhile: the new one must not be replaced by what became of the old one."""
     source = part(tmp_path, "G1 X32\n")
-    really = Client.result_of
+    really = getattr(kind, step)
 
-    def result_of(*arguments: Any, **named: Any) -> Any:
-        job = really(*arguments, **named)
+    def meanwhile(*arguments: Any, **named: Any) -> Any:
+        answer = really(*arguments, **named)
         source.write_text("G1 X1 ; sliced again\n")
-        return job
+        return answer
 
-    monkeypatch.setattr(Client, "result_of", result_of)
+    monkeypatch.setattr(kind, step, meanwhile)
     command = ["compensate", str(source), "--in-place", "-m", "ender3", "--server", address]
     assert main.run(command) == 1
     assert "another program changed the file" in capsys.readouterr().err
     assert source.read_text() == "G1 X1 ; sliced again\n"
+
+
+def test_a_report_that_cannot_be_written_costs_no_result(
+    address: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    source, report = part(tmp_path, "G1 X4\n"), tmp_path / "report"
+    (report / "report.html").mkdir(parents=True)
+    command = ["compensate", str(source), "--in-place", "-m", "ender3", "--server", address]
+    assert main.run([*command, "--report", str(report)]) == 0
+    assert source.read_text() == "; compensated\nG1 X4\n"
+    assert f"{source} is written; no report: {report}" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("proxy", ["http:foo", "foo://nas", "socks5://nas:1", "http://[::1"])

@@ -268,6 +268,12 @@ def test_a_bad_file_of_printers_says_where(tmp_path: Path, text: str, words: str
     assert "sesame" not in str(caught.value)
 
 
+def test_a_file_of_a_windows_editor(tmp_path: Path):
+    file = tmp_path / "printers.toml"
+    file.write_text(printer("a", "moonraker", "http://h"), encoding="utf-8-sig")
+    assert set(load_printers(file)) == {"a"}
+
+
 def test_no_file_no_printers(tmp_path: Path):
     assert load_printers(None) == {}
     with pytest.raises(PrinterFileError, match="gone"):

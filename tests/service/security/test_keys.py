@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from stillpath.service.security.keys import (
 )
 from stillpath.service.settings import Settings
 from tests.service.at_once import at_once
+from tests.service.jobs.site import STILLPATH
 
 
 class Clock:
@@ -213,6 +215,21 @@ def test_commands(
     rows = call("audit")[1].splitlines()[1:]
     assert [row.split("\t")[4] for row in rows] == ["key.revoke", "key.create", "key.create"]
     assert [row.action for row in AuditLog(engine).page(action="key.revoke")] == ["key.revoke"]
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is full")
+@pytest.mark.parametrize("words", ["first", "create slicer --owner ada"])
+def test_a_key_that_cannot_be_shown_is_none(
+    words: str, tmp_path: Path, engine: Engine, store: KeyStore
+):
+    """`keys first` would refuse ever after, and nobody would know the key."""
+    command = [*STILLPATH, "keys", *words.split(), "--data-dir", str(tmp_path)]
+    with Path("/dev/full").open("w") as full:
+        ran = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert (ran.returncode, "No space left" in ran.stderr) == (1, True)
+    assert store.list() == []
+    assert [row.action for row in AuditLog(engine).page()] == ["key.withdraw", "key.create"]
+    assert store.create_first() is not None
 
 
 @pytest.mark.parametrize(

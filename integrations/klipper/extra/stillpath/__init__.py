@@ -43,6 +43,7 @@ class Stillpath:
         self.export = self.toolhead = self.queue = self.filter = None
         self.motors = []
         self.engaged, self.aside, self.homing = False, 0, False
+        self.in_stream = False
         self.reason, self.passing_reason = "not started", ""
         self.late = 0
         self.busy_s = self.moved_s = self.advanced_s = 0.0
@@ -121,8 +122,9 @@ class Stillpath:
             if self.engaged and trapq == toolhead.trapq:
                 if self.filter.late_move(move[0]):
                     self._was_late()
-                if move[-1] >= self.export.accel_mm_s2:
-                    # Planned with all that the motors bear, as compensated files are.
+                if self.in_stream or move[-1] >= self.export.accel_mm_s2:
+                    # Of a compensated file: files from before 2026-11 are known by what they ask
+                    # of the motors, all that these bear.
                     self.filter.block(move[0], move[0] + sum(move[1:4]))
                 self.filter.plan.add(*move)
             return klippers_append(trapq, *move)
@@ -139,13 +141,25 @@ class Stillpath:
         on("gcode:command_error", self._command_failed)
         on("toolhead:set_position", self._placed)
         for name in ASIDE:
-            plain = self.gcode.register_command(name, None)
-            if plain is not None:
-                about = self.gcode.gcode_help.get(name)
-                self.gcode.register_command(name, self._aside_command(plain), desc=about)
+            self._wrap(name, self._standing_aside)
+        self._wrap("SET_VELOCITY_LIMIT", self._set_limits)
 
-    def _aside_command(self, plain):
-        return lambda gcmd: self._standing_aside(plain, gcmd)
+    def _wrap(self, name, function):
+        """Let `function` be called with the command that there is, and what it is given."""
+        plain = self.gcode.register_command(name, None)
+        if plain is not None:
+            about = self.gcode.gcode_help.get(name)
+            self.gcode.register_command(name, lambda gcmd: function(plain, gcmd), desc=about)
+
+    def _set_limits(self, plain, gcmd):
+        corner = gcmd.get_float("SQUARE_CORNER_VELOCITY", None)
+        if corner is not None:
+            # The mark of compensated stretches, as stillpath.cfg reads it.
+            in_stream = round(corner * 1e7) % 10 == 5
+            if in_stream != self.in_stream:
+                self.toolhead.get_last_move_time()  # moves that wait are planned as they came
+                self.in_stream = in_stream
+        return plain(gcmd)
 
     # -- on and off
 
