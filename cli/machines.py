@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from stillpath.cli.motors import motors
 from stillpath.cli.option_groups import grouped
-from stillpath.cli.own_machines import By, Message, open_machines, who
+from stillpath.cli.own_machines import By, Message, Name, open_machines, print_revision, who
 from stillpath.models.errors import ModelError
 
 if TYPE_CHECKING:
@@ -41,7 +42,6 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
-Name = Annotated[str, typer.Argument(metavar="NAME")]
 Number = Annotated[
     int | None, typer.Option("--revision", min=1, help="A revision. [default: the newest]")
 ]
@@ -164,7 +164,7 @@ def rollback(
 ) -> None:
     """Bring an earlier revision back, as a new one."""
     store = open_machines().store
-    _print_revision(store.roll_back(name, to, author=who(by), message=message))
+    print_revision(store.roll_back(name, to, author=who(by), message=message))
 
 
 @app.command()
@@ -205,7 +205,7 @@ def import_(
     from stillpath.applications.machines.transfer import import_file
 
     store = open_machines().store
-    _print_revision(import_file(store, file, author=who(by), message=message, name=name))
+    print_revision(import_file(store, file, author=who(by), message=message, name=name))
 
 
 @app.command()
@@ -218,7 +218,7 @@ def put(
 
     machine = load_machine(file)
     store = open_machines().store
-    _print_revision(
+    print_revision(
         store.add_revision(
             machine.name,
             machine,
@@ -262,54 +262,12 @@ def set_firmware(
         sources=[source],
         expected=None if as_name is None else 0,
     )
-    _print_revision(revision)
+    print_revision(revision)
     for line in _refused(machine):
         typer.echo(line)
 
 
-@app.command()
-def motors(
-    name: Name,
-    written: Annotated[
-        Path, typer.Argument(metavar="TEST", exists=True, help="What `motor-test` wrote.")
-    ],
-    console: Annotated[
-        Path, typer.Argument(metavar="CONSOLE", exists=True, help="Its console, or klippy.log.")
-    ],
-    margin: Annotated[
-        float, typer.Option(min=0.1, max=1.0, help="Fraction of the measured limit to store.")
-    ] = 0.75,
-    full_step: Annotated[
-        int, typer.Option(min=1, max=256, help="Microsteps of a full step, of X and Y.")
-    ] = 16,
-    by: By = None,
-    message: Message = "",
-) -> None:
-    """Store the limits that a search for lost steps measured, with a margin (`command`)."""
-    from stillpath.applications.proof.motor_test import borne, envelope, levels_of
-
-    levels = levels_of(written.read_text(encoding="utf-8", errors="replace"))
-    count = borne(levels, console.read_text(encoding="utf-8", errors="replace"), full_step)
-    if not count:
-        raise ModelError(
-            "steps were lost at the printer's own limits already (or the endstops do not repeat "
-            "within a full step): lower max_accel, raise the motors' current, or try again"
-        )
-    best, resolver = levels[count - 1], open_machines()
-    machine = resolver.to_look_at(name).machine
-    command = envelope(machine, best, margin)
-    end = "no step was lost" if count == len(levels) else f"level {count + 1} lost steps"
-    typer.echo(
-        f"borne: {best.accel_mm_s2:.0f} mm/s2, steps of {best.speed_step_mm_s:.0f} mm/s ({end}); "
-        f"stored, times {margin:g}: {command.accel_mm_s2:.0f} and {command.speed_step_mm_s:.0f}"
-    )
-    revision = resolver.store.add_revision(
-        name,
-        machine.model_copy(update={"command": command}),
-        author=who(by),
-        message=message or f"motors tried up to {best.accel_mm_s2:.0f} mm/s2",
-    )
-    _print_revision(revision)
+app.command()(motors)
 
 
 @app.command()
@@ -333,7 +291,7 @@ def restore(
 ) -> None:
     """Bring back a machine that was deleted under a name."""
     store = open_machines().store
-    _print_revision(store.restore(name, number))
+    print_revision(store.restore(name, number))
     for other, when in enumerate(store.trash(name), 1):
         typer.echo(f"also in the trash: number {other}, deleted {when}")
 
@@ -401,7 +359,7 @@ def from_config(
         sources=[source_file(file.name, file.read_bytes())],
         expected=0,
     )
-    _print_revision(revision)
+    print_revision(revision)
     for line in not_followed(config):
         typer.echo(f"note: {line}")
 
@@ -448,7 +406,7 @@ def from_m503(
         sources=[source_file(file.name, content)],
         expected=0,
     )
-    _print_revision(revision)
+    print_revision(revision)
     said = {field.partition("=")[0].strip() for field in fields or ()}
     assumed = [
         f"{field}={str(value).lower()}"
@@ -483,10 +441,6 @@ def _leading(revision: Revision, axis: Any) -> str:
 
     mode = leading(revision.machine.axes[axis].nominal)
     return "" if mode is None else f"{mode[0]:.1f}"
-
-
-def _print_revision(revision: Revision) -> None:
-    typer.echo(f"{revision.machine.name}: revision {revision.number} ({revision.machine.revision})")
 
 
 def _refused(machine: Machine) -> list[str]:

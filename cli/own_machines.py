@@ -1,4 +1,4 @@
-"""Opens the machines of this user, and names who changes them. Heavy imports wait until needed."""
+"""Opens the machines of this user, names and tells who changes them. Heavy imports wait."""
 
 from __future__ import annotations
 
@@ -15,22 +15,26 @@ if TYPE_CHECKING:
 
     from stillpath.applications.machines.documents import Documents
     from stillpath.applications.machines.resolve import Resolver
+    from stillpath.applications.machines.revision import Revision
     from stillpath.applications.machines.settings import MachineSettings
     from stillpath.service.settings import Settings
 
 __all__ = [
     "By",
     "Message",
+    "Name",
     "RevisionNote",
     "data_dir",
     "open_documents",
     "open_machines",
+    "print_revision",
     "service_settings",
     "who",
 ]
 
 _Made = TypeVar("_Made")
 
+Name = Annotated[str, typer.Argument(metavar="NAME")]
 By = Annotated[
     str | None, typer.Option("--by", help="Author, recorded with the revision. [default: you]")
 ]
@@ -56,6 +60,11 @@ def open_machines() -> Resolver:
         require_approval=settings.require_approval,
         max_age_days=settings.measurement_max_age_days,
     )
+
+
+def print_revision(revision: Revision) -> None:
+    """Print one line about a revision that was made."""
+    typer.echo(f"{revision.machine.name}: revision {revision.number} ({revision.machine.revision})")
 
 
 def open_documents(name: str) -> Documents:
