@@ -154,7 +154,9 @@ def test_a_full_disk_leaves_no_half_of_it(tmp_path: Path) -> None:
     """Limits would be raised and never restored."""
     command = [*STILLPATH, "motor-test", "-m", "ender3", "-o", str(tmp_path / "motors.gcode")]
     limited = ["sh", "-c", 'ulimit -f 4; exec "$@"', "sh", *command]
-    ran = subprocess.run(limited, capture_output=True, text=True, check=False)
+    # Python would keep the halves of its compiled modules, too.
+    environment = os.environ | {"PYTHONDONTWRITEBYTECODE": "1"}
+    ran = subprocess.run(limited, capture_output=True, text=True, check=False, env=environment)
     assert (ran.returncode, "motors.gcode: File too large" in ran.stderr) == (1, True)
     assert list(tmp_path.iterdir()) == []
 

@@ -250,7 +250,8 @@ def test_what_a_killed_run_left_is_deleted(running: Running, part: Path, tmp_pat
 def test_a_full_disk(running: Running, part: Path, tmp_path: Path):
     content = TEXT * 200
     part.write_bytes(content)
-    limited = ["sh", "-c", 'ulimit -f 1; exec "$@"', "sh", sys.executable, str(PROGRAM)]
+    # -B: halves of compiled modules would be kept, too.
+    limited = ["sh", "-c", 'ulimit -f 1; exec "$@"', "sh", sys.executable, "-B", str(PROGRAM)]
     done = post(*running.arguments, part, home=tmp_path, command=limited)
     assert_reason(done, 1, "large")
     assert "result: File too large" in done.stderr  # where
