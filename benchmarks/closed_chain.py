@@ -96,6 +96,7 @@ class Task:
     load_kg: float = 0.0
     belts: float = 1.0
     friction: float = 1.0
+    options: Options = field(default_factory=Options)
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,6 +166,7 @@ def main() -> int:
     parser.add_argument("--load-kg", type=float, default=0.0, help="on the bed, after measuring")
     parser.add_argument("--belts", type=float, default=1.0, help="stiffness after, over before")
     parser.add_argument("--friction", type=float, default=1.0, help="of all guides, times as drawn")
+    parser.add_argument("--tolerance-um", type=float, default=Options().tolerance_um)
     parser.add_argument("--oracle", action="store_true", help="tune shapers on the truth as well")
     parser.add_argument("--shared", type=Path, help="default: $STILLPATH_SHARED or ../shared")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
@@ -193,6 +195,7 @@ def main() -> int:
                 given.load_kg,
                 given.belts,
                 given.friction,
+                Options(tolerance_um=given.tolerance_um),
             )
             for seed in range(given.first, given.first + given.printers)
             for kind in KINDS
@@ -260,7 +263,7 @@ def judged(task: Task) -> list[Row]:
             ).rms_um
         ours, predicted = recommended, (0.0, np.inf)
         if machine is not None:
-            ours, predicted = compensated(file, own, machine, printer, task.seconds)
+            ours, predicted = compensated(file, own, machine, printer, task)
         rows.append(
             Row(
                 printer.name,
@@ -374,22 +377,22 @@ def errors_of(sections: Sequence[Timed], printer: Printer, seconds: float) -> Er
 
 
 def compensated(
-    file: Path, own: Motion, machine: Machine, printer: Printer, seconds: float
+    file: Path, own: Motion, machine: Machine, printer: Printer, task: Task
 ) -> tuple[Errors, tuple[float, float]]:
     """Errors of the written file on the printer, and the range that its report predicts."""
     with tempfile.TemporaryDirectory(prefix="stillpath-chain-") as folder:
         target = Path(folder) / "out.gcode"
-        result = compensate_file(file, target, machine, Options(), cache_dir=Path(folder))
+        result = compensate_file(file, target, machine, task.options, cache_dir=Path(folder))
         written = read_motion(target, machine)
     original = read_motion(file, machine, forced_stops(own, written))
     parts = Aligned(original, written).sections(original, written)
     (after,) = (channel for channel in result.channels if channel.name == "after")
     low_um, high_um = after.contour_range_um or 2 * (after.extruding.contour_rms_um,)
     # The report is about the whole file, the printer prints its beginning; friction is the same.
-    part = nominal_um(parts, machine, seconds) / after.extruding.contour_rms_um
+    part = nominal_um(parts, machine, task.seconds) / after.extruding.contour_rms_um
     rubbed_um = math.sqrt((after.contour_rubbing_um or high_um) ** 2 - high_um**2)
     high_um = math.hypot(part * high_um, rubbed_um)
-    return errors_of(parts, printer, seconds), (part * low_um, high_um)
+    return errors_of(parts, printer, task.seconds), (part * low_um, high_um)
 
 
 def nominal_um(parts: Sequence[Timed], machine: Machine, seconds: float) -> float:

@@ -11,7 +11,7 @@ vanish.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -62,12 +62,15 @@ class Segments:
         The timeline's group it belongs to.
     error_filter : ErrorFilter, optional
         The machine's response to errors, for later changes of the ends.
+    tolerance_mm : float
+        What they may differ from the command by.
     """
 
     end_s: NDArray[np.float64]
     end_mm: NDArray[np.float64]
     group: NDArray[np.int64]
     error_filter: ErrorFilter | None = None
+    tolerance_mm: float = 0.0
 
     def __len__(self) -> int:
         return len(self.end_s)
@@ -173,7 +176,7 @@ def fit_segments(
             last = samples - 1
         first = min(int(np.ceil((start_s + SHORTEST_S) / timeline.dt_s)), last)
         fit.stretch(i, start_s, first, last, tolerance_mm + END_EXCESS_MM)
-    return fit.segments()
+    return replace(fit.segments(), tolerance_mm=tolerance_mm)
 
 
 class _Fit:

@@ -114,14 +114,15 @@ class Choice:
         return float(np.clip(self.rms_um / _COARSE_UM, _LEAST_FIT, 1.0))
 
     def ranged(
-        self, channels: Sequence[Channel], *, steps: bool, share: float = 1.0
+        self, channels: Sequence[Channel], *, command_share: float = 1.0, share: float = 1.0
     ) -> list[Channel]:
         """Return the channels of a report with the range over the members.
 
         Parameters
         ----------
-        steps : bool
-            Whether the figures include whole motor steps.
+        command_share : float
+            Least share of the figures that is the error of the commands themselves; the rest may be
+            that of motor steps or segments.
         share : float
             Share of the extruding time that is compensated; the rest moves as sliced.
         """
@@ -135,7 +136,7 @@ class Choice:
                 if channel.name == "after" and reference is not None:
                     left = (1.0 - share) * (before_um / max(channel.judged_rms_um, 1e-9)) ** 2
                     known = known.mixed(reference, min(left, 1.0) if share else 1.0)
-                channel = known.applied_to(channel, harder, steps=steps)
+                channel = known.applied_to(channel, harder, command_share=command_share)
             updated.append(channel)
         return updated
 

@@ -39,7 +39,7 @@ _FRICTION_UNSURE = 0.35
 _FRICTION_UNSEEN_MM_S2 = 1500.0
 """Dry friction over moving mass that tables may hide: .4 N on .25 kg of rails, 1.5 N on a bed."""
 _STEPS_UNSURE = 0.2
-"""Relative spread over the members of the error caused by whole motor steps: a guess."""
+"""Relative spread over the members of the error of motor steps and segments: a guess."""
 _LAG_UNSURE_S = 1.5e-4
 """Unknown delay of X against Y: alignment sets both to 0, but viscous guides may delay one; clocks
 of logs tell some of it (`models.identification.clocks`)."""
@@ -67,12 +67,12 @@ class ErrorRange:
     friction_um: float = 0.0
 
     def around_um(
-        self, predicted_um: float, harder: float = 1.0, *, steps: bool = False
+        self, predicted_um: float, harder: float = 1.0, *, command_share: float = 1.0
     ) -> tuple[float, float]:
         """Return the range around the prediction for a print, without unseen friction.
 
-        The error of a command differs between members; what whole motor steps add to it hardly
-        does.
+        The error of a command differs between members; what whole motor steps or a coarse fit of
+        segments add to it hardly does.
 
         Parameters
         ----------
@@ -80,10 +80,11 @@ class ErrorRange:
             Contour error of the nominal plants on the print, rms.
         harder : float
             Ratio of the uncompensated error of the print to that on the reference motion.
-        steps : bool
-            Whether the prediction includes whole motor steps.
+        command_share : float
+            Least share of the prediction that is the command's own error; the rest may be that of
+            motor steps or segments.
         """
-        own_um = min(predicted_um, harder * self.reference_um) if steps else predicted_um
+        own_um = min(max(command_share * predicted_um, harder * self.reference_um), predicted_um)
         rounded_um = math.sqrt(predicted_um**2 - own_um**2)
         return (
             math.hypot(self.low * own_um, (1.0 - _STEPS_UNSURE) * rounded_um),
@@ -99,13 +100,15 @@ class ErrorRange:
             )
         )
 
-    def applied_to(self, channel: Channel, harder: float = 1.0, *, steps: bool = False) -> Channel:
+    def applied_to(
+        self, channel: Channel, harder: float = 1.0, *, command_share: float = 1.0
+    ) -> Channel:
         """Return a channel with its range, and with how far friction may exceed it.
 
         What friction adds depends on where a path turns and hardly on its speed: it is added as it
         was found on the reference motion.
         """
-        low_um, high_um = self.around_um(channel.judged_rms_um, harder, steps=steps)
+        low_um, high_um = self.around_um(channel.judged_rms_um, harder, command_share=command_share)
         rubbing_um = math.hypot(high_um, self.friction_um) if self.friction_um else None
         ranges = {"contour_range_um": (low_um, high_um), "contour_rubbing_um": rubbing_um}
         return channel.model_copy(update=ranges)

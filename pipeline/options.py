@@ -22,6 +22,7 @@ from stillpath.models.machine import Machine
 from stillpath.version import __version__
 
 __all__ = [
+    "COARSE_UM",
     "LEAST_BUDGET_UM",
     "BasisName",
     "BudgetUm",
@@ -63,6 +64,8 @@ RobustMode = Literal["auto", "off", "ensemble", "minimax"]
 DialectName = Literal["klipper", "marlin", "prusa", "bambu", "reprapfirmware"]
 Where = Literal["all", "visible", "walls"]
 MaxMb = Annotated[float, Field(gt=0, le=100_000, allow_inf_nan=False)]
+COARSE_UM = 5.0
+"""Tolerance from which segments add an error of their own that counts."""
 LEAST_BUDGET_UM = 0.5
 BudgetUm = Annotated[float, Field(ge=LEAST_BUDGET_UM, le=1000, allow_inf_nan=False)]
 

@@ -30,7 +30,7 @@ from stillpath.pipeline.filament import feed_evenly, retract_along
 from stillpath.pipeline.following import follow_tolerance_mm, strayed
 from stillpath.pipeline.measuring._peak_kernels import peaks, speed_step
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
-from stillpath.pipeline.options import Options
+from stillpath.pipeline.options import COARSE_UM, Options
 
 __all__ = [
     "DT_S",
@@ -48,8 +48,8 @@ _REST_TOLERANCE_S = 5e-3
 _ROUNDS = 2
 _STEP_SHARE = 0.3
 """Share of what motors bear by which speeds step from segment to segment: M220 may double it."""
-_COARSE_MM, _COARSE_GRID_MM = 5e-3, 1e-3
-"""Tolerance from which three decimals do: files are 5 % smaller."""
+_COARSE_GRID_MM = 1e-3
+"""Three decimals do for a coarse fit: files are 5 % smaller."""
 _ACCEL_SHARES = (1.0, 0.8, 0.6, 0.5)
 """Shares of the largest acceleration, tried in turn where a motor's speed step is too large."""
 _SOFT_S = (2e-3, 4e-3, 8e-3)
@@ -246,7 +246,9 @@ class PieceCompensator:
         # The command's own speed may change by more within a sample.
         step_mm_s = max(bend_mm / timeline.dt_s, _STEP_SHARE * limit)
         for _ in range(3):
-            grid_mm = max(self.encoder.grid_mm, _COARSE_GRID_MM if tolerance >= _COARSE_MM else 0.0)
+            grid_mm = max(
+                self.encoder.grid_mm, _COARSE_GRID_MM if tolerance >= 1e-3 * COARSE_UM else 0.0
+            )
             segments = fit_segments(
                 timeline,
                 command,

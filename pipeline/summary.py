@@ -16,7 +16,7 @@ from stillpath.pipeline.clock import StageClock
 from stillpath.pipeline.measuring.measure import Measurement
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.pipeline.operating_point import Operation
-from stillpath.pipeline.options import Options
+from stillpath.pipeline.options import COARSE_UM, Options
 from stillpath.pipeline.pacing.budget import SpeedBudget
 from stillpath.pipeline.pacing.budget_measure import BudgetMeasurement
 from stillpath.pipeline.reading import passed_over
@@ -100,8 +100,11 @@ class Summary:
             ]
         if self.choice is not None:
             steps = any(adapter(self.machine).step_mm[:2])
-            share = self.totals.compensated_share
-            channels = self.choice.ranged(channels, steps=steps, share=share)
+            channels = self.choice.ranged(
+                channels,
+                command_share=0.0 if steps else min(1.0, COARSE_UM / self.options.tolerance_um),
+                share=self.totals.compensated_share,
+            )
         return channels
 
     def _warnings(self, channels: list[Channel]) -> Iterator[str]:

@@ -27,8 +27,9 @@ __all__ = ["Lattice", "steps_within", "vertices_on_steps"]
 
 _FILAMENT_MM = 0.01
 """Filament error that counts as much as a step of X."""
-_OFTEN_S = 4e-3
-"""Largest spacing of vertices on straight lines, so that errors average out."""
+_OFTEN_S, _FINE_MM = 4e-3, 2.5e-3
+"""Largest spacing of vertices on straight lines, so that errors average out, up to this tolerance;
+above it they are farther apart in proportion."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,10 +119,13 @@ def vertices_on_steps(lattice: Lattice, timeline: Timeline, segments: Segments) 
     response = _response_of(segments.error_filter)
     direction = np.empty((2, timeline.position_mm.shape[1]))
     path_directions(timeline.position_mm[:2], direction)
+    often_s = _OFTEN_S * max(1.0, segments.tolerance_mm / _FINE_MM)
+    often_s = max(often_s, 2.0 / lattice.moves_per_s)
     end_s, end_mm, groups = [], [], []
     for group, rows in segments.stretches():
         at_s = np.append(timeline.start_s[group], segments.end_s[rows])
         at_mm = np.vstack([timeline.group_start_mm[group], segments.end_mm[:, rows].T])
+        at_s, at_mm = _often(lattice, at_s, at_mm, often_s)
         at_s, at_mm = _chosen(lattice, timeline.dt_s, at_s, at_mm, response, direction)
         end_s.append(at_s[1:])
         end_mm.append(at_mm[1:])
@@ -218,7 +222,6 @@ def _chosen(
     direction: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Vertices of one stretch and its start, times (n,) and places (n, 4)."""
-    at_s, at_mm = _often(lattice, at_s, at_mm)
     near, scale, n = _Stretch.of(lattice.per_mm, dt_s, at_s, at_mm), lattice.per_mm, len(at_s)
     heading = direction[:, np.minimum(near.samples, direction.shape[1] - 1)].T.copy()
     places = Places(
@@ -255,12 +258,11 @@ def _chosen(
 
 
 def _often(
-    lattice: Lattice, at_s: NDArray[np.float64], at_mm: NDArray[np.float64]
+    lattice: Lattice, at_s: NDArray[np.float64], at_mm: NDArray[np.float64], often_s: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Put vertices between those of a fit, where both they and the lines have room for them."""
     way = np.abs(np.diff(at_mm, axis=0)) * lattice.per_mm
     hops = way[:, 0] + way[:, 1] if lattice.corexy else np.maximum(way[:, 0], way[:, 1])
-    often_s = max(_OFTEN_S, 2.0 / lattice.moves_per_s)
     parts = np.ceil(np.minimum(np.diff(at_s) / often_s - 1e-9, hops / (2.0 * lattice.least)))
     parts = np.maximum(parts, 1.0).astype(np.int64)
     index = np.arange(len(at_s), dtype=np.float64)

@@ -56,6 +56,7 @@ def choose(
     at_s: NDArray[Any],
     least: int = 6,
     answer: ErrorFilter | None = RIGID,
+    tolerance_mm: float = 0.0,
     **options: Any,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Times and places in steps, X Y, for a fit with its start; it may have a column of E."""
@@ -63,7 +64,7 @@ def choose(
     mm[:, :2] = fit[:, :2]
     mm[:, 3] = fit[:, 2] if fit.shape[1] > 2 else 0.0
     group = np.zeros(len(fit) - 1, np.int64)
-    segments = Segments(at_s[1:] + 0.25, mm[1:].T.copy(), group, answer)
+    segments = Segments(at_s[1:] + 0.25, mm[1:].T.copy(), group, answer, tolerance_mm)
     own = vertices_on_steps(lattice(least, **options), timeline_of(mm, at_s + 0.25), segments)
     return np.append(0.0, own.end_s - 0.25), np.vstack([mm[0, :2], own.end_mm[:2].T])
 
@@ -139,6 +140,16 @@ def test_straight_lines_are_followed_far_closer_than_by_rounding(least: int) -> 
         rounded[k] = answered(sampled(np.round(fit), at_s) - wanted)
     assert ours.mean() < 0.15 * rounded.mean()
     assert np.all(ours < np.maximum(0.75 * rounded, 0.15))
+
+
+def test_a_coarse_fit_has_fewer_vertices_on_straight_lines() -> None:
+    fit, at_s = np.array([[0.0, 0.0], [2400.0, 700.0]]), np.array([0.0, 0.4])
+    fine, coarse = (
+        len(choose(fit, at_s, 1, SOFT, tolerance_mm=tolerance_mm)[0])
+        for tolerance_mm in (2e-3, 1e-2)
+    )
+    assert fine == pytest.approx(100, rel=0.1)
+    assert coarse == pytest.approx(25, rel=0.2)
 
 
 def test_a_turn_below_the_least_is_kept_in_place() -> None:

@@ -192,7 +192,7 @@ def channel(name: str, rms_um: float) -> Channel:
     return Channel(name=name, label=name, extruding=errors, all_motion=errors, residual_rms_um=0.0)
 
 
-def test_what_motor_steps_add_is_much_the_same_for_all_plants() -> None:
+def test_what_motor_steps_or_segments_add_is_much_the_same_for_all_plants() -> None:
     choice = Choice(
         shares=(1.0, 1.0),
         worst=1.0,
@@ -203,15 +203,18 @@ def test_what_motor_steps_add_is_much_the_same_for_all_plants() -> None:
     )
     # Twice as much is shaken off as on the reference motion: .6 of these 3 um are the command's.
     channels = [channel("before", 20.0), channel("after", 3.0), channel("shaper", 4.0)]
-    smooth, stepped = (choice.ranged(channels, steps=steps) for steps in (False, True))
+    smooth, coarse, stepped = (choice.ranged(channels, command_share=s) for s in (1.0, 0.5, 0.0))
     assert smooth[1].contour_range_um == pytest.approx((3.0, 30.0))
     rounded_um = (3.0**2 - 0.6**2) ** 0.5
     expected = (np.hypot(0.6, 0.8 * rounded_um), np.hypot(6.0, 1.2 * rounded_um))
     assert stepped[1].contour_range_um == pytest.approx(expected)
+    half_um = (3.0**2 - 1.5**2) ** 0.5
+    expected = (np.hypot(1.5, 0.8 * half_um), np.hypot(15.0, 1.2 * half_um))
+    assert coarse[1].contour_range_um == pytest.approx(expected)
     assert smooth[0].contour_range_um == stepped[0].contour_range_um == pytest.approx((18.0, 24.0))
     assert stepped[2].contour_range_um is None
     # Of 5 um, a hundredth of the time as sliced leaves 2: .16 of the square.
-    part = choice.ranged([channels[0], channel("after", 5.0)], steps=False, share=0.99)[1]
+    part = choice.ranged([channels[0], channel("after", 5.0)], share=0.99)[1]
     high_um = 5.0 * (0.84 * 10.0**2 + 0.16 * 1.2**2) ** 0.5
     assert part.contour_range_um == pytest.approx((5.0 * (0.84 + 0.16 * 0.9**2) ** 0.5, high_um))
     # Friction holds an axis back by as much on a print that is twice as hard.
