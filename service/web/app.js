@@ -11,6 +11,19 @@ get("skip").addEventListener("click", (/** @type {Event} */ event) => {
   get("main").focus();
 });
 get("forget-key").addEventListener("click", forgetKey);
+// A wrong value in a folded part would keep its form from being sent, and the browser could not show it.
+addEventListener("invalid", (event) => {
+  const folded = /** @type {Element} */ (event.target).closest("details");
+  if (folded) folded.open = true;
+}, true);
+// A file that misses its place must not open instead of the page.
+for (const kind of /** @type {const} */ (["dragover", "drop"])) {
+  addEventListener(kind, (event) => {
+    if (event.defaultPrevented || !event.dataTransfer?.types.includes("Files")) return;
+    event.preventDefault();
+    event.dataTransfer.dropEffect = "none";
+  });
+}
 wireThemeSwitch(get("theme"), get("theme-name"));
 showForget();
 startRouter(get("main"), [

@@ -142,6 +142,31 @@ def test_one_channel_at_a_time_and_all_layers_as_a_table(visitor: Visitor, gear:
     expect(page.get_by_role("slider", name="Layer")).to_be_focused()
 
 
+def test_a_finger_chooses_a_layer_and_sees_it(visitor: Visitor, gear: dict[str, Any]):
+    page = opened(
+        visitor, gear, viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True
+    )
+    stage = page.locator(".stage").bounding_box()
+    zoom = page.get_by_role("group", name="Zoom", exact=True).bounding_box()
+    assert stage is not None
+    assert zoom is not None
+    assert zoom["y"] + zoom["height"] <= stage["y"]
+    page.get_by_text("All layers as a table").tap()
+    button = page.locator(".layers tbody button").last
+    button.scroll_into_view_if_needed()
+    page.evaluate("document.querySelector('.layers tbody tr:last-child').scrollIntoView(true)")
+    size = button.bounding_box()
+    assert size is not None
+    assert min(size["width"], size["height"]) >= 44
+    button.tap()
+    settled(page)
+    expect(page.locator(".layers output")).to_contain_text(button.inner_text())
+    shown = page.locator(".stage").bounding_box()
+    assert shown is not None
+    assert shown["y"] >= 0
+    assert shown["y"] + shown["height"] <= 844
+
+
 def test_curves_are_read_by_keys_and_as_tables(visitor: Visitor, gear: dict[str, Any]):
     page = opened(visitor, gear)
     plot = page.get_by_role("group", name=re.compile("^Contour error along the print"))

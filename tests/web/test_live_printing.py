@@ -32,6 +32,8 @@ def test_a_file_is_printed_live(visitor: Visitor, tmp_path: Path) -> None:
     page.get_by_label("Print it live").check()
     expect(page.get_by_label("Tolerance, µm")).to_be_hidden()
     visitor.shoot(page, "live-form")
+    page.get_by_label("Print it as a file").check()
+    page.get_by_label("Tolerance, µm").fill("0.1")  # out of bounds, and soon hidden
     hand_in(page, tmp_path, "Predict")
     expect(page.get_by_role("heading", name="How to print it")).to_be_visible()
     visitor.shoot(page, "live-report")

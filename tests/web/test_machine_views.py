@@ -48,6 +48,10 @@ def test_revisions_are_compared_approved_and_brought_back(visitor: Visitor, serv
     page.get_by_role("button", name="Go back to revision 1").click()
     page.get_by_role("dialog").get_by_role("button", name="Go back").click()
     expect(revisions).to_contain_text("Back to 1")
+    expect(page.locator("h1")).to_be_focused()
+    page.get_by_text("Travel and limits").click()
+    expect(page.locator("dl.facts")).to_contain_text("Max accel")
+    expect(page.locator("dl.facts")).not_to_contain_text("4321")
     history = service.api.get("/v1/machines/changed/revisions").json()["revisions"]
     assert [r["restored"] for r in history] == [None, None, 1]
     assert history[1]["approval"]["author"] == "clara"
@@ -121,6 +125,13 @@ def test_a_measurement_that_cannot_be_used_is_named(visitor: Visitor, tmp_path: 
     page = visitor.open("#/machines/ender3")
     page.locator("input[type=file]").set_input_files(file)
     page.get_by_label("Name of your machine").fill("mine")
+    fold = page.get_by_text("How the test was run")
+    fold.click()
+    page.locator("#test-min_freq").fill("-5")
+    fold.click()
+    page.get_by_role("button", name="Look at the fit").click()
+    expect(page.locator("#test-min_freq")).to_be_focused()
+    page.locator("#test-min_freq").fill("")
     page.get_by_role("button", name="Look at the fit").click()
     expect(page.get_by_role("alert")).to_contain_text("raw_data_x_broken.csv")
     expect(page.get_by_role("alert")).to_contain_text("Identification not possible")

@@ -89,6 +89,16 @@ def test_the_machine_is_found_by_typing_and_remembered(visitor: Visitor):
     expect(page.get_by_role("listbox")).to_contain_text("No machine")
     page.keyboard.press("Escape")
     expect(field).to_have_value(chosen)
+    # Leaving the field takes what was typed, not the machine before.
+    hint = page.locator("#machine-hint")
+    field.fill("ender 3")
+    page.keyboard.press("Tab")
+    expect(hint).to_contain_text("ender3 ·")
+    for typed, said in (("voron", "fits 2 machines"), ("no such", "No machine has")):
+        field.fill(typed)
+        page.keyboard.press("Tab")
+        expect(field).to_have_value(typed)
+        expect(hint).to_contain_text(said)
 
 
 def test_a_finger_scrolls_the_machines_and_chooses_by_tapping(visitor: Visitor):
@@ -137,6 +147,93 @@ def test_files_that_cannot_be_meant_are_not_sent(
     hand_in(page, file)
     expect(page.get_by_role("alert")).to_contain_text(said)
     expect(page.get_by_role("button", name="Compensate")).to_be_enabled()
+
+
+def test_a_wrong_value_that_is_folded_away_is_shown(visitor: Visitor, tmp_path: Path):
+    file = tmp_path / "part.gcode"
+    file.write_bytes(PART)
+    page = visitor.open()
+    fold = page.get_by_text("More options")
+    fold.click()
+    page.get_by_label("Speed budget, µm").fill("0.1")
+    fold.click()
+    hand_in(page, file)
+    expect(page.get_by_label("Speed budget, µm")).to_be_focused()
+
+
+def test_leaving_an_upload_is_told(visitor: Visitor, tmp_path: Path):
+    file = tmp_path / "part.gcode"
+    file.write_bytes(PART)
+    page = visitor.open()
+    # Sent, and never answered.
+    page.route(
+        "**/v1/jobs?*", lambda route: None if route.request.method == "POST" else route.continue_()
+    )
+    hand_in(page, file)
+    expect(page.get_by_role("progressbar", name="Sent")).to_be_visible()
+    with page.expect_event("dialog", timeout=20_000) as question:
+        page.evaluate("setTimeout(() => location.reload())")
+    assert question.value.type == "beforeunload"
+    question.value.dismiss()
+    page.get_by_role("link", name="Jobs", exact=True).first.click()
+    dialog = page.get_by_role("dialog")
+    expect(dialog).to_contain_text("part.gcode")
+    dialog.get_by_role("button", name="Choose it again").click()
+    expect(page.locator("h1")).to_have_text("New job")
+    page.reload()  # asks nothing any more
+
+
+def test_a_file_dropped_beside_its_place_opens_nothing(visitor: Visitor):
+    page = visitor.open()
+    prevented = page.evaluate(
+        """["dragover", "drop"].map((kind) => {
+          const dataTransfer = new DataTransfer();
+          dataTransfer.items.add(new File(["G28"], "part.gcode"));
+          const event = new DragEvent(kind, { bubbles: true, cancelable: true, dataTransfer });
+          document.querySelector("h1").dispatchEvent(event);
+          return event.defaultPrevented;
+        })"""
+    )
+    assert prevented == [True, True]
+
+
+def test_a_file_sliced_again_is_to_be_chosen_again(visitor: Visitor, tmp_path: Path):
+    file = tmp_path / "part.gcode"
+    file.write_bytes(PART)
+    visitor.expected = {"ERR_UPLOAD_FILE_CHANGED"}
+    page = visitor.open()
+    page.locator("input[type=file]").set_input_files(file)
+    choose_machine(page, "ender")
+    file.write_bytes(PART + b"; sliced again\n")
+    page.get_by_role("button", name="Compensate").click()
+    expect(page.get_by_role("alert")).to_contain_text("part.gcode has changed since it was chosen")
+    with page.expect_file_chooser() as chooser:
+        page.locator("input[type=file]").click()
+    chooser.value.set_files(file)
+    page.get_by_role("button", name="Compensate").click()
+    page.wait_for_url("**/#/jobs/*")
+
+
+@pytest.mark.parametrize("missed", [r"report\.json$", r"/layers$", r"layers/viewer\.js$"])
+def test_what_did_not_come_is_fetched_again(visitor: Visitor, gear: dict[str, Any], missed: str):
+    visitor.expected = {503}
+    page = visitor.open("#/")
+    page.route(re.compile(missed), lambda route: route.fulfill(status=503), times=1)
+    page.goto(f"{visitor.url}/#/jobs/{gear['id']}")
+    expect(page.get_by_role("alert")).to_be_visible()
+    page.get_by_role("button", name="Try again").click()
+    expect(page.locator(".stage[data-renderer]")).to_be_visible()
+    expect(page.get_by_role("alert")).to_have_count(0)
+
+
+def test_a_view_that_did_not_come_is_fetched_again(visitor: Visitor):
+    visitor.expected = {503}
+    page = visitor.open("#/")
+    page.route("**/views/machines.js", lambda route: route.fulfill(status=503), times=1)
+    page.get_by_role("link", name="Machines").click()
+    expect(page.get_by_role("alert")).to_contain_text("The service does not answer")
+    page.get_by_role("button", name="Try again").click()
+    expect(page.locator("h1")).to_have_text("Machines")
 
 
 def test_a_request_that_is_refused_says_why(visitor: Visitor, tmp_path: Path):
@@ -306,6 +403,21 @@ def test_a_key_is_asked_for_and_goes_along(guarded: Service, visitor: Visitor, t
     assert KEY not in page.evaluate("JSON.stringify({...localStorage}) + document.cookie")
     page.get_by_role("button", name="Forget key").click()
     expect(page.get_by_role("dialog")).to_contain_text("asks for a key")
+
+
+@pytest.mark.parametrize("view", ["#/", "#/jobs"])
+def test_who_has_no_key_is_asked_once(guarded: Service, visitor: Visitor, view: str):
+    visitor.expected = {401}
+    page = visitor.open(view, at=guarded.url)
+    page.get_by_role("button", name="Not now").click()
+    expect(page.get_by_role("alert")).to_contain_text("This service asks for a key")
+    page.wait_for_timeout(2500)  # the list is fetched every two seconds
+    expect(page.get_by_role("dialog")).to_have_count(0)
+    page.get_by_role("button", name="Enter a key").click()
+    page.get_by_label("Key", exact=True).fill(KEY)
+    page.get_by_role("button", name="Use this key").click()
+    expect(page.get_by_role("alert")).to_have_count(0)
+    expect(page.get_by_role("dialog")).to_have_count(0)
 
 
 def test_a_key_does_where_the_browser_stores_nothing(guarded: Service, visitor: Visitor):

@@ -22,8 +22,8 @@ class Visitor:
     url: str
     artefacts: Path | None
     complaints: list[str] = field(default_factory=list)
-    expected: set[int] = field(default_factory=set)
-    """Statuses of answers that the test provokes; browsers log them as errors."""
+    expected: set[int | str] = field(default_factory=set)
+    """What the test provokes and browsers log as errors: statuses, and names of network errors."""
     contexts: list[BrowserContext] = field(default_factory=list)
 
     def open(
@@ -57,6 +57,7 @@ class Visitor:
     def _note(self, message: Any) -> None:
         if message.type not in ("error", "warning"):
             return
-        status = re.search(r"the server responded with a status of (\d+)", message.text)
-        if status is None or int(status[1]) not in self.expected:
+        found = re.search(r"the server responded with a status of (\d+)|net::(\w+)", message.text)
+        cause = None if found is None else found[2] or int(found[1])
+        if cause not in self.expected:
             self.complaints.append(f"{message.type}: {message.text}")

@@ -1,10 +1,10 @@
 /** What was measured on the written file, from the headline to the reverted pieces. */
 
-import { h } from "../lib/dom.js";
+import { fill, h } from "../lib/dom.js";
 import { isAbort } from "../lib/api.js";
 import { namingControls } from "../lib/controls.js";
 import { bytes, capital, counted, duration, grouped, um } from "../lib/format.js";
-import { problemPanel } from "../lib/problem.js";
+import { retryPanel, unreachable } from "../lib/problem.js";
 import { folded, longTable, table } from "../parts/table.js";
 import { headline } from "./headline.js";
 import { spectra, trackChart } from "./curves.js";
@@ -68,18 +68,27 @@ function errorTable(channels, labels) {
 function layers(job, labels, signal) {
   const where = job.links.layers;
   if (!where) return null;
-  const area = h("div", { "aria-busy": "true" }, h("p.hint", null, "Fetching the layers …"));
+  const area = h("div");
   const shown = section("Layer by layer", area);
-  import("../layers/viewer.js").then(({ layerView }) => layerView(where, labels, signal)).then((view) => {
-    if (view === null) shown.remove();
-    else area.replaceChildren(view);
+  async function load() {
+    fill(area, h("p.hint", null, "Fetching the layers …"));
+    area.setAttribute("aria-busy", "true");
+    try {
+      const { layerView } = await import("../layers/viewer.js").catch(() => {
+        throw unreachable();
+      });
+      const view = await layerView(where, labels, signal);
+      if (view === null) shown.remove();
+      else fill(area, view);
+    } catch (/** @type {any} */ error) {
+      if (isAbort(error)) return;
+      // Jobs of earlier versions have no layers.
+      if (error.status === 404) shown.remove();
+      else fill(area, retryPanel(error, load));
+    }
     area.removeAttribute("aria-busy");
-  }).catch((error) => {
-    if (isAbort(error)) return;
-    // Jobs of earlier versions have no layers.
-    if (error?.status === 404) shown.remove();
-    else area.replaceChildren(problemPanel(error));
-  });
+  }
+  load();
   return shown;
 }
 

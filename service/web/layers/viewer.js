@@ -116,8 +116,8 @@ export async function layerView(where, labels, signal) {
   slider.addEventListener("input", () => go(Number(slider.value)));
   const tool = (/** @type {string} */ text, /** @type {string} */ label, /** @type {() => void} */ act) =>
     h("button", { type: "button", "aria-label": label, title: label, onclick: act }, text);
-  stage.element.append(h("div.zoom", { role: "group", "aria-label": "Zoom" },
-    tool("+", "Zoom in", () => zoom(1.5)), tool("−", "Zoom out", () => zoom(1 / 1.5)), tool("⤢", "Show all", fit)));
+  const tools = h("div.zoom", { role: "group", "aria-label": "Zoom" },
+    tool("+", "Zoom in", () => zoom(1.5)), tool("−", "Zoom out", () => zoom(1 / 1.5)), tool("⤢", "Show all", fit));
   const worst = h("button", { type: "button", onclick: () => {
     if (tile === null) return;
     const k = worstPoint(tile, channel);
@@ -130,13 +130,15 @@ export async function layerView(where, labels, signal) {
     h("div.controls", null,
       h("label", { for: "layer" }, "Layer"),
       tool("−", "Layer below", () => go(wanted - 1)), slider, tool("+", "Layer above", () => go(wanted + 1)), name),
-    h("div.row", null, choice, worst),
+    h("div.row", null, choice, worst, tools),
     stage.element, readout, fault,
     h("div.legend-bar", { role: "img", "aria-label": `Colours from 0 to ${index.scale_um} micrometres of contour error` }, stage.legend, h("div.ticks", null, ticks)),
     h("p.hint.keys", null, KEYS.map(([key, what]) => h("span", null, h("kbd", null, key), ` ${what}`))),
     folded("All layers as a table", () => layerTable(index, labels, (k) => {
       go(k);
-      slider.focus();
+      // The table is far below the picture; the focus alone would bring the slider half-way up.
+      slider.focus({ preventScroll: true });
+      for (const part of [slider, stage.element]) part.scrollIntoView({ block: "nearest" });
     })));
 
   wireGestures(stage.element, {

@@ -1,6 +1,6 @@
 /** Requests to the service: the key goes along, problems are thrown. */
 
-import { askForKey, keyHeaders, storedKey } from "./keys.js";
+import { askForKey, keyHeaders, keyProblem, storedKey } from "./keys.js";
 import { ProblemError, problemOf, unreachable } from "./problem.js";
 
 const LOOK_MS = 1000;
@@ -12,6 +12,7 @@ const LOOK_MS = 1000;
  * @property {BodyInit} [body]
  * @property {Record<string, string>} [headers]
  * @property {AbortSignal} [signal]
+ * @property {boolean} [ask] Whether a missing key is asked for; not where nobody waits for the answer.
  */
 
 /**
@@ -22,6 +23,7 @@ const LOOK_MS = 1000;
  * @returns {Promise<Response>} A success.
  */
 export async function request(path, asking = {}) {
+  const { ask = true } = asking;
   for (;;) {
     const shown = storedKey();
     const answer = await send(path, asking);
@@ -29,7 +31,7 @@ export async function request(path, asking = {}) {
     const problem = problemOf(answer.status, await answer.text());
     if (answer.status !== 401) throw problem;
     // Another request may have been given a key meanwhile.
-    if (storedKey() === shown && !(await askForKey(problem.message))) throw problem;
+    if (storedKey() === shown && !(ask && await askForKey(problem.message))) throw new ProblemError(keyProblem(problem.message));
   }
 }
 
@@ -95,7 +97,7 @@ export async function upload(path, query, body, onProgress, signal) {
     if (status >= 200 && status < 300) return JSON.parse(text);
     const problem = problemOf(status, text);
     if (status !== 401) throw problem;
-    if (storedKey() === shown && !(await askForKey(problem.message))) throw problem;
+    if (storedKey() === shown && !(await askForKey(problem.message))) throw new ProblemError(keyProblem(problem.message));
   }
 }
 
@@ -118,6 +120,24 @@ function pause(ms, signal) {
   });
 }
 
+/**
+ * Say why nothing came back: files that were saved anew since they were chosen cannot be read.
+ *
+ * @param {BodyInit | undefined} body
+ * @returns {Promise<ProblemError>}
+ */
+async function silence(body) {
+  for (const part of body instanceof FormData ? body.values() : [body]) {
+    if (!(part instanceof File)) continue;
+    try {
+      await part.slice(0, 1).arrayBuffer();
+    } catch {
+      return new ProblemError({ title: "The file has changed", detail: `${part.name} has changed since it was chosen. Choose it again.` });
+    }
+  }
+  return unreachable();
+}
+
 /** @param {string} path @param {Asking} asking @returns {Promise<Response>} */
 async function send(path, { method = "GET", query, body, headers, signal }) {
   try {
@@ -126,7 +146,7 @@ async function send(path, { method = "GET", query, body, headers, signal }) {
     });
   } catch (error) {
     if (isAbort(error)) throw error;
-    throw unreachable();
+    throw await silence(body);
   }
 }
 
@@ -144,7 +164,7 @@ function post(url, body, onProgress, signal) {
     sending.setRequestHeader("Content-Type", "application/octet-stream");
     for (const [name, value] of Object.entries(keyHeaders())) sending.setRequestHeader(name, value);
     sending.upload.onprogress = (event) => onProgress(event.total ? event.loaded / event.total : 0);
-    sending.onerror = () => reject(unreachable());
+    sending.onerror = async () => reject(await silence(body));
     sending.onabort = () => reject(new DOMException("The upload was cancelled.", "AbortError"));
     sending.onload = () => resolve({ status: sending.status, text: sending.responseText });
     signal.addEventListener("abort", () => sending.abort());

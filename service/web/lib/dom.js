@@ -31,6 +31,18 @@ export function fill(element, ...children) {
 }
 
 /**
+ * Hide or show a part of a form. What is hidden is disabled too: the browser would refuse to send
+ * the form for a wrong value that nobody sees.
+ *
+ * @param {HTMLElement} part
+ * @param {boolean} isHidden
+ */
+export function hide(part, isHidden) {
+  part.hidden = isHidden;
+  for (const control of part.querySelectorAll("input, select")) /** @type {HTMLInputElement} */ (control).disabled = isHidden;
+}
+
+/**
  * Return the ids that tie a label to its field.
  *
  * @param {string} stem

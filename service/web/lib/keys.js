@@ -40,15 +40,24 @@ export function forgetKey() {
  * @returns {Promise<boolean>} Whether one was given.
  */
 export function askForKey(reason) {
-  // Without one before, nothing is wrong yet.
-  asking ??= ask(storedKey() === null ? "Enter one to submit files and to see your own jobs." : reason).finally(() => {
+  asking ??= ask(keyProblem(reason)).finally(() => {
     asking = null;
   });
   return asking;
 }
 
-/** @param {string} reason @returns {Promise<boolean>} */
-function ask(reason) {
+/**
+ * @param {string} reason What the service said of the key that was shown.
+ * @returns {{title: string, detail: string, status: number}}
+ */
+export function keyProblem(reason) {
+  // Without one before, nothing is wrong yet.
+  const detail = storedKey() === null ? "Enter one to submit files and to see your own jobs." : reason;
+  return { title: "This service asks for a key", detail, status: 401 };
+}
+
+/** @param {{title: string, detail: string}} problem @returns {Promise<boolean>} */
+function ask({ title, detail }) {
   return new Promise((resolve) => {
     const field = h("input", {
       type: "password", id: "key", name: "key", autocomplete: "off", spellcheck: "false",
@@ -58,8 +67,8 @@ function ask(reason) {
       h("form", { method: "dialog", onsubmit: () => {
         dialog.returnValue = "given";
       } },
-        h("h2", { id: "key-title" }, "This service asks for a key"),
-        h("p", { id: "key-reason" }, reason),
+        h("h2", { id: "key-title" }, title),
+        h("p", { id: "key-reason" }, detail),
         h("label", { for: "key" }, "Key"),
         field,
         h("p.hint", null, "It is kept in this tab only. Whoever runs the service makes keys with “stillpath keys”."),

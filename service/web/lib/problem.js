@@ -66,6 +66,19 @@ export function problemPanel(error, ...actions) {
   );
 }
 
+/**
+ * Return the panel of a problem that may be over when it is tried again.
+ *
+ * @param {any} error
+ * @param {() => any} retry
+ * @param {...Node} actions
+ * @returns {HTMLElement}
+ */
+export function retryPanel(error, retry, ...actions) {
+  const text = error?.status === 401 ? "Enter a key" : "Try again";
+  return problemPanel(error, h("button", { type: "button", onclick: retry }, text), ...actions);
+}
+
 /** @param {unknown} error @returns {Record<string, any>} */
 function asDocument(error) {
   if (error instanceof Error) {

@@ -2,7 +2,7 @@
 
 import { isAbort } from "./api.js";
 import { fill, h } from "./dom.js";
-import { problemPanel } from "./problem.js";
+import { retryPanel, unreachable } from "./problem.js";
 
 /**
  * @typedef {object} Place Where a view is drawn.
@@ -44,16 +44,17 @@ export function startRouter(main, routes) {
         setTitle("No such page");
       } else {
         const params = (route.pattern.exec(path) ?? []).slice(1).map(decodeURIComponent);
-        const view = await route.load();
+        const view = await route.load().catch(() => {
+          throw unreachable();
+        });
         if (here.signal.aborted) return;
         await view.show({ main, signal: here.signal, setTitle, params });
       }
     } catch (error) {
       if (isAbort(error) || here.signal.aborted) return;
       main.querySelector(":scope > .late")?.remove();
-      const actions = [h("button", { type: "button", onclick: show }, "Try again")];
-      if (route !== undefined && path.startsWith(`/${route.name}/`)) actions.push(h("a.button", { href: `#/${route.name}` }, `All ${route.name}`));
-      main.append(problemPanel(error, ...actions));
+      const all = route !== undefined && path.startsWith(`/${route.name}/`) ? [h("a.button", { href: `#/${route.name}` }, `All ${route.name}`)] : [];
+      main.append(retryPanel(error, show, ...all));
     }
     if (!first && !here.signal.aborted) focusHeading(main);
     first = false;

@@ -55,19 +55,21 @@ export async function revisionPanel(where, name, signal) {
 
   async function approve(/** @type {number} */ number) {
     const asked = await who({ title: `Approve revision ${number}?`, text: `Jobs may then use this state of ${name}. An approval cannot be taken back.`, yes: "Approve", no: "Not now", danger: false });
-    if (asked) await change(`/revisions/${number}/approve`, asked, {}, `Revision ${number} is approved.`);
+    if (asked) await change(`/revisions/${number}/approve`, asked, {}, `Revision ${number} is approved.`, load);
   }
 
   async function rollBack(/** @type {number} */ number, /** @type {any} */ newest) {
     const asked = await who({ title: `Go back to revision ${number}?`, text: "Its state comes back as a new revision; nothing is lost.", yes: "Go back", no: "Stay" });
-    if (asked) await change(`/revisions/${number}/rollback`, asked, { "If-Match": `"${newest.revision}"` }, `Back to revision ${number}.`);
+    if (asked) await change(`/revisions/${number}/rollback`, asked, { "If-Match": `"${newest.revision}"` }, `Back to revision ${number}.`,
+      // All of the page shows the newest revision.
+      () => dispatchEvent(new HashChangeEvent("hashchange")));
   }
 
-  async function change(/** @type {string} */ path, /** @type {Record<string, string>} */ query, /** @type {Record<string, string>} */ headers, /** @type {string} */ said) {
+  async function change(/** @type {string} */ path, /** @type {Record<string, string>} */ query, /** @type {Record<string, string>} */ headers, /** @type {string} */ said, /** @type {() => any} */ redraw) {
     await act(async () => {
       await request(where + path, { method: "POST", query, headers, signal });
       announce(said);
-      await load();
+      await redraw();
     });
   }
 

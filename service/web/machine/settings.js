@@ -2,7 +2,7 @@
 
 import { isAbort, request } from "../lib/api.js";
 import { announce } from "../lib/announce.js";
-import { fill, h } from "../lib/dom.js";
+import { fill, h, hide } from "../lib/dom.js";
 import { problemPanel } from "../lib/problem.js";
 import { dropZone } from "../parts/drop-zone.js";
 import { NAME } from "./name.js";
@@ -48,7 +48,7 @@ export function settingsPanel({ machine, signal }) {
   async function onChoose([chosen]) {
     text = await chosen.text();
     file = chosen.name;
-    marlin.hidden = !M503.test(text);
+    hide(marlin, !M503.test(text));
     travel.required = !machine && !marlin.hidden;
     keep.disabled = false;
     fill(status);

@@ -24,6 +24,10 @@ export function dropZone({ label, hint, accept, multiple = false, onChoose }) {
     fill(more, `${bytes(total)}${files.length > 1 ? `: ${files.map((f) => f.name).join(", ")}` : " · choose another"}`);
     onChoose(files);
   };
+  // The same file chosen again, as after slicing anew, is a change too.
+  input.addEventListener("click", () => {
+    input.value = "";
+  });
   input.addEventListener("change", () => take(input.files));
   // Entering a child fires `dragleave` on the zone, so that levels are counted.
   let depth = 0;

@@ -1,6 +1,8 @@
 /** A field to choose a machine by typing a part of its name (ARIA combobox with a listbox). */
 
+import { announce } from "../lib/announce.js";
 import { fill, h } from "../lib/dom.js";
+import { counted } from "../lib/format.js";
 
 /**
  * @typedef {{name: string, title: string, origin: string, kinematics: string,
@@ -50,9 +52,12 @@ export function machinePicker(machines, chosen, onChoose) {
       list.children[active].scrollIntoView({ block: "nearest" });
     } else input.removeAttribute("aria-activedescendant");
   };
-  const search = (/** @type {string} */ text) => {
+  const fitting = (/** @type {string} */ text) => {
     const words = text.toLowerCase().split(/\s+/).filter(Boolean);
-    shown = usable.filter((m) => words.every((w) => `${m.title} ${m.name}`.toLowerCase().includes(w)));
+    return usable.filter((m) => words.every((w) => `${m.title} ${m.name}`.toLowerCase().includes(w)));
+  };
+  const search = (/** @type {string} */ text) => {
+    shown = fitting(text);
     active = shown.length && text ? 0 : shown.findIndex((m) => m === current);
     draw();
     open(true);
@@ -64,13 +69,27 @@ export function machinePicker(machines, chosen, onChoose) {
     tell();
     onChoose(machine?.name ?? null);
   };
+  /** Take what was typed where it means one machine; else none: a file for another would be wrong. */
+  const settle = () => {
+    const text = input.value;
+    if (text === (current?.title ?? "")) return choose(current);
+    const fits = fitting(text);
+    const named = fits.filter((m) => [m.name, m.title].some((word) => word.toLowerCase() === text.trim().toLowerCase()));
+    const [meant, ...others] = named.length ? named : fits;
+    if (meant && !others.length) return choose(meant);
+    choose(null);
+    input.value = text;
+    if (text.trim() === "") return;
+    fill(hint, fits.length ? `“${text}” fits ${counted(fits.length, "machine")}: choose one from the list.` : `No machine has “${text}” in its name: choose one from the list.`);
+    announce(hint.textContent);
+  };
 
   input.addEventListener("input", () => search(input.value));
   input.addEventListener("click", () => {
     if (list.hidden) search("");
   });
   input.addEventListener("focus", () => input.select());
-  input.addEventListener("blur", () => choose(current));
+  input.addEventListener("blur", settle);
   input.addEventListener("keydown", (/** @type {KeyboardEvent} */ event) => {
     const step = { ArrowDown: 1, ArrowUp: -1 }[event.key];
     if (step) {

@@ -5,7 +5,7 @@ import { announce } from "../lib/announce.js";
 import { confirmed } from "../lib/dialog.js";
 import { fill, h } from "../lib/dom.js";
 import { bytes, when } from "../lib/format.js";
-import { problemPanel } from "../lib/problem.js";
+import { problemPanel, retryPanel } from "../lib/problem.js";
 import { isOver, watchJob } from "../lib/watch.js";
 import { stateBadge } from "../parts/state.js";
 import { showDeliveries } from "../job/deliveries.js";
@@ -38,7 +38,10 @@ export async function show({ main, signal, setTitle, params: [id] }) {
     fill(actions, isOver(job) ? deleteButton(job) : cancelButton(job));
     if (isOver(job)) showDeliveries(sent, job, signal);
     if (!isOver(job)) fill(body, progress.element);
-    else if (state === "done") finished(job);
+    else if (state === "done") {
+      actions.prepend(downloads(job));
+      finished(job);
+    }
     else if (state === "failed") fill(body, problemPanel(job.error, again()));
     else fill(body, h("p.empty", null, "This job was cancelled; nothing was written."), again());
     if (isNews) announce(`${job.source_name}: ${state}`);
@@ -47,12 +50,11 @@ export async function show({ main, signal, setTitle, params: [id] }) {
   async function finished(/** @type {any} */ job) {
     const area = h("div", { "aria-busy": "true" }, h("p.hint", null, "Fetching the report …"));
     fill(body, area);
-    actions.prepend(downloads(job));
     try {
       const report = await getJson(`/v1/jobs/${job.id}/report.json`, { signal });
       fill(area, ...reportSections(job, report, signal));
     } catch (error) {
-      if (!isAbort(error)) fill(area, problemPanel(error));
+      if (!isAbort(error)) fill(area, retryPanel(error, () => finished(job)));
     }
     area.removeAttribute("aria-busy");
   }

@@ -5,7 +5,7 @@ import { announce } from "../lib/announce.js";
 import { confirmed } from "../lib/dialog.js";
 import { fill, h } from "../lib/dom.js";
 import { bytes, duration, um, umOrRange, when } from "../lib/format.js";
-import { problemPanel } from "../lib/problem.js";
+import { problemPanel, retryPanel } from "../lib/problem.js";
 import { isOver } from "../lib/watch.js";
 import { stateBadge } from "../parts/state.js";
 
@@ -21,6 +21,7 @@ export async function show({ main, signal, setTitle }) {
   let cursors = [null];
   /** @type {any} */
   let page = { jobs: [], next: null };
+  let lacksKey = false;
   const list = h("div.jobs");
   const pager = h("nav.pager", { "aria-label": "Pages of jobs" });
   const fault = h("div");
@@ -36,14 +37,17 @@ export async function show({ main, signal, setTitle }) {
     }, text)));
   fill(main, h("div.head", null, h("h1", null, "Jobs"), h("a.button.main.end", { href: "#/" }, "New job")), h("div.filter", null, filter), fault, list, pager);
 
-  async function reload(tells = false) {
+  async function reload(tells = false, ask = true) {
     try {
-      page = await getJson("/v1/jobs", { query: { state, limit: PAGE, cursor: cursors.at(-1) }, signal });
+      page = await getJson("/v1/jobs", { query: { state, limit: PAGE, cursor: cursors.at(-1) }, signal, ask });
+      lacksKey = false;
       fill(fault);
       draw();
       if (tells) announce(page.jobs.length ? `${page.jobs.length} jobs on this page` : "No jobs");
-    } catch (error) {
-      if (!isAbort(error)) fill(fault, problemPanel(error));
+    } catch (/** @type {any} */ error) {
+      if (isAbort(error)) return;
+      lacksKey = error.status === 401;
+      fill(fault, lacksKey ? retryPanel(error, () => reload(true)) : problemPanel(error));
     }
   }
 
@@ -100,7 +104,7 @@ export async function show({ main, signal, setTitle }) {
 
   await reload();
   const timer = setInterval(() => {
-    if (!document.hidden && (cursors.length === 1 || page.jobs.some((/** @type {any} */ j) => !isOver(j)))) reload();
+    if (!document.hidden && !lacksKey && (cursors.length === 1 || page.jobs.some((/** @type {any} */ j) => !isOver(j)))) reload(false, false);
   }, REFRESH_MS);
   signal.addEventListener("abort", () => clearInterval(timer));
 }

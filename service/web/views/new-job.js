@@ -2,8 +2,9 @@
 
 import { getJson, isAbort, upload } from "../lib/api.js";
 import { announce } from "../lib/announce.js";
+import { confirmed } from "../lib/dialog.js";
 import { namingControls } from "../lib/controls.js";
-import { fill, h } from "../lib/dom.js";
+import { fill, h, hide } from "../lib/dom.js";
 import { bytes } from "../lib/format.js";
 import { problemPanel } from "../lib/problem.js";
 import { dropZone } from "../parts/drop-zone.js";
@@ -42,7 +43,7 @@ export async function show({ main, signal, setTitle }) {
     const refusal = machines.find((/** @type {any} */ m) => m.name === machine)?.live_refusal ?? null;
     way.refuse(refusal);
     const live = way.isLive();
-    for (const part of written) part.hidden = live;
+    for (const part of written) hide(part, live);
     options.showFor(live);
     fill(send, live ? "Predict" : method.value === "none" ? "Measure" : "Compensate");
   };
@@ -92,6 +93,8 @@ export async function show({ main, signal, setTitle }) {
     const bar = h("progress", { max: "1", value: "0", "aria-label": "Sent" });
     const text = h("span", null, "Sending …");
     const name = file.name;
+    const warn = (/** @type {Event} */ event) => event.preventDefault();
+    addEventListener("beforeunload", warn);
     send.disabled = true;
     fill(status, h("div.sending", null, bar, h("div.row", null, text,
       h("button", { type: "button", onclick: () => sending.abort() }, "Cancel"))));
@@ -104,10 +107,20 @@ export async function show({ main, signal, setTitle }) {
       }, sending.signal);
       location.hash = `#/jobs/${job.id}`;
     } catch (error) {
+      if (signal.aborted) return notSent(name);
       fill(status, isAbort(error) ? h("p.hint", null, "Not sent.") : problemPanel(error));
       ready();
+    } finally {
+      removeEventListener("beforeunload", warn);
     }
   }
+}
+
+/** Tell that leaving the page ended an upload. @param {string} name */
+async function notSent(name) {
+  const text = `You left the page while ${name} was on its way.`;
+  const again = await confirmed({ title: "The file was not sent", text, yes: "Choose it again", no: "Leave it", danger: false });
+  if (again) location.hash = "#/";
 }
 
 /** What can be told of a file without sending it. @param {File} file @returns {{title: string, detail: string} | null} */
@@ -142,9 +155,7 @@ function moreOptions() {
       field("dialect", "File is written for", dialect),
       field("plate", "Plate of a 3MF package", plate)),
     h("label.check", { for: "fresh" }, fresh, "Compute again even if the same file was done before"));
-  const showFor = (/** @type {boolean} */ live) => ofWritten.forEach((part) => {
-    part.hidden = live;
-  });
+  const showFor = (/** @type {boolean} */ live) => ofWritten.forEach((part) => hide(part, live));
   const readFile = () => ({ plate: plate.value, dialect: dialect.value, fresh: fresh.checked ? "true" : "" });
   const read = () => ({
     basis: basis.value, robust: robust.value, along: along.value, budget_um: budget.value, where: where.value, max_mb: most.value, plate: plate.value,
