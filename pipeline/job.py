@@ -73,6 +73,8 @@ _SAID = (Unfit, GcodeError, DesignError, ModelError)
 """Errors whose message tells the user why a piece cannot be compensated."""
 _FAULTS = (*_SAID, ArithmeticError, AssertionError, LookupError, TypeError, ValueError)
 """These and our own bugs: only the piece concerned stays as sliced."""
+_CHOSEN, _COMPENSATED = 0.2, 0.99
+"""Shares of the work done when the speeds are chosen, and when the last piece is compensated."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,8 +206,9 @@ class Job:
         GcodeError, TooLarge
         """
         size = max(self._source.seek(0, io.SEEK_END), 1)
+        begun = 0.0
         if self._pairs is not None and self._budget is None:
-            self._budget = self._chosen_paces(size)
+            self._budget, begun = self._chosen_paces(size), _CHOSEN
         self._source.seek(0)
         for item in self._selected():
             self._point = self._operation.at(item.moves)
@@ -215,7 +218,9 @@ class Job:
             else:
                 self._verbatim(item)
             self._operation.passed(item.moves)
-            self._say("compensating", self._source.tell() / size)
+            # Not source.tell(): a whole block is read before its first piece is compensated.
+            share = (item.text_offset + len(item.text)) / size
+            self._say("compensating", begun + (_COMPENSATED - begun) * share)
         if self._sum.moves == 0:
             raise GcodeError("the file contains no moves; is it G-code with LF line ends?")
         if self._changes:
@@ -259,7 +264,7 @@ class Job:
                 self._source,
                 self._machine,
                 dialect_for(self._machine, self._options.dialect),
-                lambda read: self._say("choosing speeds", read / size),
+                lambda read: self._say("choosing speeds", _CHOSEN * read / size),
             )
             return SpeedBudget.chosen(
                 found, self._machine, self._options, self._shaper, self._caution

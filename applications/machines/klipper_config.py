@@ -130,13 +130,18 @@ def read_printer_config(path: Path) -> PrinterConfig:
     return parse_printer_config(as_utf8(content).decode(errors="replace"), path.name)
 
 
-def parse_printer_config(text: str, name: str) -> PrinterConfig:
-    """Return what `read_printer_config` does, of the text of a file called `name`."""
+def parse_printer_config(
+    text: str, name: str, wanted: str = "Klipper's printer.cfg"
+) -> PrinterConfig:
+    """Return what `read_printer_config` does, of the text of a file called `name`.
+
+    An error asks for what is `wanted`.
+    """
     lines = text.removeprefix("\ufeff").splitlines()
     own, includes = _parse(lines, saved=False)
     saved, _ = _parse(lines, saved=True)
     if not own:
-        raise ModelError(f"{name}: no [section] in it; give Klipper's printer.cfg")
+        raise ModelError(f"{name}: no [section] in it; give {wanted}")
     sections = {
         name: saved.get(name, {}) | own.get(name, {}) for name in dict.fromkeys([*own, *saved])
     }

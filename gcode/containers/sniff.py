@@ -5,6 +5,7 @@ Slicers hand post-processing scripts files without an extension or with one of t
 
 from __future__ import annotations
 
+import re
 from enum import Enum
 from pathlib import Path
 
@@ -35,6 +36,7 @@ _FOREIGN = {
     b"Rar!": "a RAR archive",
     b"\x7fELF": "a program",
 }
+_JSON = re.compile(rb'(\xef\xbb\xbf)?\s*\{\s*"')
 _STL_HEAD_BYTES = 84
 """Header of a binary STL model: 80 arbitrary bytes and the number of facets in four."""
 _STL_FACET_BYTES = 50
@@ -69,6 +71,8 @@ def foreign(path: Path) -> str | None:
         return "empty"
     if size == _STL_HEAD_BYTES + _STL_FACET_BYTES * int.from_bytes(head[-4:], "little"):
         return _FOREIGN[b"solid"]
+    if _JSON.match(head):
+        return "JSON, such as a machine or a report"
     return next((what for magic, what in _FOREIGN.items() if head.startswith(magic)), None)
 
 

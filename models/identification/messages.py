@@ -124,8 +124,8 @@ def fit_warnings(fit: Fit, sources: Sequence[str], warned: Sequence[str]) -> tup
     else:
         limits, missed = (_POOR, _USELESS), f"{fit.residual:.0%}"
     remedy = (
-        "Allow more modes (max_order), leave out files of another state of the machine, or "
-        "measure again"
+        "Leave out files of another state of the machine, measure again, or allow more modes "
+        "(max_order, over HTTP and on the command line)"
     )
     if fit.residual > limits[1]:
         raise ModelError(

@@ -28,10 +28,11 @@ from stillpath.service.api.uploads import receive_document, safe_name
 __all__ = ["router"]
 
 _LARGEST_BYTES = 4_000_000
+_WANTED = "Klipper's printer.cfg, or Marlin's answer to M503"
 _BODY = {
     "requestBody": {
         "required": True,
-        "description": "Klipper's printer.cfg, or Marlin's output of M503.",
+        "description": f"{_WANTED}.",
         "content": {"text/plain": {"schema": {"type": "string"}}},
     }
 }
@@ -121,7 +122,7 @@ async def put_settings(
 def _new(text: str, file: str, name: str, given: _Given) -> Machine:
     stated = StatedMachine(name, given.title, (given.fx, given.fy))
     if not marlin_settings.looks_like_m503(text):
-        config = parse_printer_config(text, file)
+        config = parse_printer_config(text, file, _WANTED)
         return machine_from_config(config, stated)
     if not given.travel:
         raise Problem(

@@ -362,8 +362,8 @@ def _expected(store: MachineStore, name: str, if_match: str | None) -> int:
             raise Problem(
                 428,
                 "Precondition required",
-                f"Machine {name!r} exists. Send its ETag as If-Match, so that nobody's change is "
-                "lost.",
+                f"Machine {name!r} exists already. Take another name; or, to change it, send its "
+                "ETag as If-Match, so that nobody's change is lost.",
             )
         return _check_state(store, name, if_match)
 

@@ -221,7 +221,12 @@ _EXAMPLES: dict[int, dict[str, Any]] = {
             "Invalid parameter",
             "tolerance_um: must be at least 0.5 µm (given: '0.1')",
         ),
-        problem(428, "Precondition required", "Machine 'mine' exists. Send its ETag as If-Match."),
+        problem(
+            428,
+            "Precondition required",
+            "Machine 'mine' exists already. Take another name; or, to change it, send its ETag as "
+            "If-Match, so that nobody's change is lost.",
+        ),
         problem(429, "Too many requests", "More than 1200 requests in a minute. Wait 1 s."),
         problem(503, "Not ready", not_ready("database")),
         problem(507, "No space left", "The disk of the service is full. Delete old jobs."),

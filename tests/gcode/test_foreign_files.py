@@ -18,6 +18,7 @@ from stillpath.gcode.errors import GcodeError
         (b"solid cube\n facet normal 0 0 1\n", "STL"),
         (b"a cube".ljust(80) + b"\1\0\0\0".ljust(48), "STL"),
         (b"\x1f\x8b\x08\x00", "gzip"),
+        (b'{\r\n  "name": "mine"}\n', "JSON"),
     ],
 )
 def test_it_says_what_the_file_is(tmp_path: Path, head: bytes, word: str) -> None:
@@ -34,7 +35,9 @@ def test_an_empty_file_is_called_so(tmp_path: Path) -> None:
         pass
 
 
-@pytest.mark.parametrize("text", [b"\n", b"%\nG28\n", b";solid\nG28\n", b"G28", b"<x\n"])
+@pytest.mark.parametrize(
+    "text", [b"\n", b"%\nG28\n", b";solid\nG28\n", b"G28", b"<x\n", b"{if x}\n"]
+)
 def test_gcode_is_not_taken_for_it(tmp_path: Path, text: bytes) -> None:
     path = tmp_path / "part.gcode"
     path.write_bytes(text)

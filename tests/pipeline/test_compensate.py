@@ -230,16 +230,24 @@ def test_cancelled(tmp_path: Path, cache: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["in.gcode", "out.gcode"]
 
 
-def test_progress_runs_to_the_end(tmp_path: Path, cache: Path) -> None:
+@pytest.mark.parametrize("budget_um", [None, 60.0])
+def test_progress_runs_to_the_end(tmp_path: Path, cache: Path, budget_um: float | None) -> None:
     source = tmp_path / "in.gcode"
     source.write_bytes(SMALL * 3)
     seen: list[Progress] = []
-    compensate_file(source, tmp_path / "o.gcode", load_machine("ender3"), Options(),
+    options = Options(budget_um=budget_um)
+    compensate_file(source, tmp_path / "o.gcode", load_machine("ender3"), options,
                     cache_dir=cache, progress=seen.append)  # fmt: skip
     fractions = [p.fraction for p in seen]
     assert fractions == sorted(fractions)
     assert (fractions[0], fractions[-1]) == (0.0, 1.0)
     assert seen[-1].print_seconds > 1
+    # The file is one block: reading runs far ahead of the work.
+    compensating = [p.fraction for p in seen if p.stage == "compensating"]
+    assert len(set(compensating)) >= 3
+    assert compensating[0] < 0.6
+    assert compensating[-1] < 1.0
+    assert all(p.fraction < 0.5 for p in seen if p.stage == "choosing speeds")
 
 
 def test_tallies_are_the_whole_array_s() -> None:

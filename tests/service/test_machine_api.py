@@ -100,7 +100,7 @@ def test_a_machine_from_birth_to_deletion(client: TestClient):
 def test_nobody_loses_a_change(client: TestClient):
     assert_problem(put(client, changed(50.0), **{"If-Match": '"abc"'}), 412, "without If-Match")
     old = put(client, changed(50.0)).headers["etag"]
-    assert_problem(put(client, changed(51.0)), 428, "If-Match")
+    assert_problem(put(client, changed(51.0)), 428, "Take another name", "If-Match")
     assert put(client, changed(51.0), **{"If-Match": f'"other", {old}'}).status_code == 200
     stale = {"If-Match": old}
     assert_problem(put(client, changed(52.0), **stale), 412, "revision 2", old.strip('"'))
@@ -265,6 +265,7 @@ def test_a_machine_of_a_printer_cfg(client: TestClient):
     ("text", "query", "words"),
     [
         ("[printer]\n", {"file": "printer.cfg"}, ["printer.cfg: [printer] lacks max_velocity"]),
+        ("{}", {}, ["settings.txt: no [section] in it", "printer.cfg, or", "answer to M503"]),
         (M503, {"travel": "far"}, ["far", "235x235x250"]),
         (M503, {"travel": "1x1x1", "fx": "0"}, ["fx: must be at least 1 (given: '0')"]),
         (M503.replace("M92", "M93"), {"travel": "1x1x1"}, ["no M92 X in it"]),

@@ -66,6 +66,8 @@ def test_a_measurement_is_tried_then_kept(visitor: Visitor, service: Service, tm
     page = visitor.open("#/machines/measured")
     page.locator("input[type=file]").set_input_files(file)
     page.get_by_text("How the test was run").click()
+    expect(page.get_by_text("only what lies between From and To is fitted")).to_be_visible()
+    expect(page.get_by_label("To, Hz")).to_have_attribute("placeholder", "135 (133.3)")
     for name, value in QUICK_QUERY.items():
         page.locator(f"#test-{name}").fill(str(value))
     page.get_by_role("button", name="Look at the fit").click()

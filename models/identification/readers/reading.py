@@ -153,8 +153,9 @@ def _from_table(table: Table, axis: str | None, settings: ReadSettings) -> tuple
         hint = "; of a pass ripple is learnt: say what repeats (--ripple NAME:PITCH)"
     elif table.names and len(table.rows) > 1:
         hint = (
-            "; if it records a command and what followed, say which columns (time_column, "
-            "command_column, measured_column)"
+            "; if it records a command and what followed, call those columns time_s, cmd_acc and "
+            "meas_acc in its first line, or say which they are (time_column, command_column, "
+            "measured_column)"
         )
     raise ModelError(
         f"{table.source}: not a known format; looked for {_LOOKED_FOR}{hint}. The first line is "

@@ -10,8 +10,8 @@ import { NAME } from "./name.js";
 import { fitPlots } from "./plots.js";
 
 const TEST = [
-  ["min_freq", "From, Hz", "5"], ["max_freq", "To, Hz", "135"], ["hz_per_sec", "Hz per second", "1"],
-  ["accel_per_hz", "Acceleration per Hz, mm/s", "60"], ["sweeping_accel", "Sweeping acceleration, mm/s²", "400"],
+  ["min_freq", "From, Hz", "5"], ["max_freq", "To, Hz", "135 (133.3)"], ["hz_per_sec", "Hz per second", "1"],
+  ["accel_per_hz", "Acceleration per Hz, mm/s", "60 (75)"], ["sweeping_accel", "Sweeping acceleration, mm/s²", "400 (0)"],
 ];
 
 /**
@@ -89,7 +89,7 @@ function testOptions() {
   const inputs = TEST.map(([name, , hint]) => h("input", { type: "number", id: `test-${name}`, min: "0", step: "any", placeholder: hint }));
   const axis = h("select", { id: "test-axis" }, [["", "As the files say"], ["x", "X"], ["y", "Y"]].map(([value, text]) => h("option", { value }, text)));
   const element = h("details", null, h("summary", null, "How the test was run"),
-    h("p.hint", null, "Needed for raw logs only, where the test did not have Klipper's default values."),
+    h("p.hint", null, "Empty: as the file says, else Klipper's default as shown; in brackets that for files whose name has a date before 2024-12. Of a table of resonances only what lies between From and To is fitted."),
     h("div.fields", null,
       h("div.field", null, h("label", { for: "test-axis" }, "Axis"), axis),
       TEST.map(([name, label], k) => h("div.field", null, h("label", { for: `test-${name}` }, label), inputs[k]))));

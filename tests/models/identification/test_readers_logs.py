@@ -241,7 +241,9 @@ def test_drive_faults() -> None:
     rows = "".join(f"{k / 500},{k % 7},{k % 5}\n" for k in range(90))
     with pytest.raises(ModelError, match="column 'meas_acc' is missing"):
         read("time_s,cmd_acc,y\n" + rows)
-    with pytest.raises(ModelError, match="say which columns"):
+    with pytest.raises(
+        ModelError, match=r"call those columns time_s, cmd_acc and .* first line.*\(time_column"
+    ):
         read("t,u,y\n" + rows)
     with pytest.raises(ModelError, match="no column 7, counted from 0; it has 3"):
         read("t,u,y\n" + rows, time_column="t", command_column=7, measured_column="y")
