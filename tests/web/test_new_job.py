@@ -197,23 +197,6 @@ def test_a_file_dropped_beside_its_place_opens_nothing(visitor: Visitor):
     assert prevented == [True, True]
 
 
-def test_a_file_sliced_again_is_to_be_chosen_again(visitor: Visitor, tmp_path: Path):
-    file = tmp_path / "part.gcode"
-    file.write_bytes(PART)
-    visitor.expected = {"ERR_UPLOAD_FILE_CHANGED"}
-    page = visitor.open()
-    page.locator("input[type=file]").set_input_files(file)
-    choose_machine(page, "ender")
-    file.write_bytes(PART + b"; sliced again\n")
-    page.get_by_role("button", name="Compensate").click()
-    expect(page.get_by_role("alert")).to_contain_text("part.gcode has changed since it was chosen")
-    with page.expect_file_chooser() as chooser:
-        page.locator("input[type=file]").click()
-    chooser.value.set_files(file)
-    page.get_by_role("button", name="Compensate").click()
-    page.wait_for_url("**/#/jobs/*")
-
-
 @pytest.mark.parametrize("missed", [r"report\.json$", r"/layers$", r"layers/viewer\.js$"])
 def test_what_did_not_come_is_fetched_again(visitor: Visitor, gear: dict[str, Any], missed: str):
     visitor.expected = {503}
