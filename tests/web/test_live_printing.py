@@ -16,7 +16,7 @@ from tests.web.visitor import Visitor
 pytestmark = pytest.mark.slow
 
 
-def hand_in(page: Page, tmp_path: Path, button: str, machine: str = "ender") -> None:
+def hand_in(page: Page, tmp_path: Path, button: str, machine: str = "ender3") -> None:
     file = tmp_path / "part.gcode"
     file.write_bytes(SOURCE)
     page.locator("input[type=file]").set_input_files(file)
@@ -66,7 +66,7 @@ def test_a_compensated_file_is_compared_with_live_printing(
 
 def test_a_machine_that_cannot_says_why(visitor: Visitor) -> None:
     page = visitor.open(script=_ENDER3_RUNS_MARLIN)
-    choose_machine(page, "ender")
+    choose_machine(page, "ender3")
     expect(page.get_by_label("Print it live")).to_be_disabled()
     expect(page.get_by_text("It cannot be printed live: it runs marlin.")).to_be_visible()
     choose_machine(page, "voron v0")

@@ -126,7 +126,7 @@ function pause(ms, signal) {
  * @param {BodyInit | undefined} body
  * @returns {Promise<ProblemError>}
  */
-async function silence(body) {
+export async function silence(body) {
   for (const part of body instanceof FormData ? body.values() : [body]) {
     if (!(part instanceof File)) continue;
     try {
