@@ -33,6 +33,8 @@ def backup(
     settings = _of_one_computer(data_dir)
     if target.is_dir():
         target /= f"stillpath-{datetime.now().astimezone():%Y%m%d-%H%M%S}.tar"
+    elif not target.suffix:
+        raise ModelError(f"there is no folder {target}; make it, or name a new .tar file")
     try:
         manifest = back_up(settings.data_dir, target)
     except BackupError as error:

@@ -42,6 +42,8 @@ _PASSING = frozenset(
     {"incoming", "scratch", "cache", "jobs", "first-key", "disk-reserve", _BACKUPS, _LOCK}
 )
 """What is no data at the top of the directory, a secret, or led to by the database (jobs)."""
+_STAYING = frozenset({_LOCK, RESTORING, _BACKUPS})
+"""What may be at the top of a directory that is restored into, and stays."""
 _DAMAGES = (
     *(tarfile.TarError, gzip.BadGzipFile, zlib.error),
     *(EOFError, ValidationError, UnicodeError),
@@ -84,15 +86,16 @@ def back_up(data_dir: Path, target: Path) -> Manifest:
         raise BackupError(f"there is no data directory {data_dir}; name it with --data-dir")
     if target.exists():
         raise BackupError(f"{target} already exists; name a new file")
-    if target.resolve().is_relative_to(data_dir.resolve()):
-        if not target.resolve().is_relative_to(data_dir.resolve() / _BACKUPS):
-            raise BackupError(
-                f"{target} lies in the data directory; name a file elsewhere, or in "
-                f"{data_dir / _BACKUPS}"
-            )
+    if _is_in_backups(target, data_dir):
         private_folder(target.parent)
     if is_half_restored(data_dir):
         raise BackupError(f"{data_dir}: a restore was broken off there; finish it first")
+    database = data_dir / DATABASE
+    if not database.exists() and _below(data_dir / "jobs"):
+        raise BackupError(
+            f"the database {database} is missing, and without it the files of jobs are not backed "
+            "up; put it back, or restore an earlier backup"
+        )
     with (
         replacing(target, mode=0o600) as temporary,
         tempfile.TemporaryDirectory(dir=target.parent, prefix=".backup-") as work,
@@ -102,8 +105,14 @@ def back_up(data_dir: Path, target: Path) -> Manifest:
     ):
         archive = _Archive(tar)
         jobs = 0
-        if (data_dir / DATABASE).exists():
-            jobs = _add_jobs(archive, data_dir, Path(work) / DATABASE)
+        if database.exists():
+            try:
+                jobs = _add_jobs(archive, data_dir, Path(work) / DATABASE)
+            except sqlite3.Error as error:
+                raise BackupError(
+                    f"the database {database} cannot be copied: {error}; if it is empty or "
+                    "damaged, restore an earlier backup"
+                ) from None
         _add_rest(archive, data_dir)
         manifest = Manifest(version=__version__, jobs=jobs, files=archive.files)
         archive.add_text(_MANIFEST, manifest.model_dump_json(indent=1))
@@ -113,6 +122,11 @@ def back_up(data_dir: Path, target: Path) -> Manifest:
 def restore(source: Path, data_dir: Path) -> Manifest:
     """Fill an empty data directory from an archive; every file is checked before any counts.
 
+    Parameters
+    ----------
+    source : Path
+        In the data directory only below ``backups``, which may be there and stays.
+
     Raises
     ------
     BackupError
@@ -120,6 +134,7 @@ def restore(source: Path, data_dir: Path) -> Manifest:
     OSError
         EBUSY if a service works with the directory.
     """
+    _is_in_backups(source, data_dir)
     with exclusive(data_dir):
         fresh = data_dir / RESTORING
         if fresh.exists():
@@ -129,7 +144,7 @@ def restore(source: Path, data_dir: Path) -> Manifest:
                     "it away, or name another folder with --data-dir"
                 )
             _clear(data_dir)  # whatever else is here came from that restore
-        there = sorted(p.name for p in data_dir.iterdir() if p.name not in (_LOCK, RESTORING))
+        there = sorted(p.name for p in data_dir.iterdir() if p.name not in _STAYING)
         if there:
             raise BackupError(
                 f"{data_dir} is not empty ({', '.join(there[:3])}); move it away, or name another "
@@ -329,12 +344,25 @@ def _chunks(content: IO[bytes]) -> Iterator[bytes]:
 
 def _is_inside(name: str) -> bool:
     path = PurePosixPath(name)
-    return not path.is_absolute() and ".." not in path.parts and "\\" not in name
+    stays = bool(_STAYING & {*path.parts[:1]})
+    return not (path.is_absolute() or ".." in path.parts or "\\" in name or stays)
+
+
+def _is_in_backups(file: Path, data_dir: Path) -> bool:
+    """Return whether an archive lies in the folder of backups; refuse the rest of the directory."""
+    place, root = file.resolve(), data_dir.resolve()
+    if not place.is_relative_to(root):
+        return False
+    if root / _BACKUPS not in place.parents:
+        raise BackupError(
+            f"{file} lies in the data directory; name a file elsewhere, or in {data_dir / _BACKUPS}"
+        )
+    return True
 
 
 def _clear(data_dir: Path) -> None:
     for path in data_dir.iterdir():
-        if path.name in (_LOCK, RESTORING):
+        if path.name in _STAYING:
             continue
         if path.is_dir():
             shutil.rmtree(path)

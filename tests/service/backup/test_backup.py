@@ -203,7 +203,9 @@ def test_a_damaged_archive_changes_nothing(store, data, tmp_path):
     assert run(["restore", str(target), "--data-dir", str(tmp_path / "new")]) == 2
 
 
-@pytest.mark.parametrize("name", ["../evil", "/evil", "a/../../evil", "..\\evil"])
+@pytest.mark.parametrize(
+    "name", ["../evil", "/evil", "a/../../evil", "..\\evil", "backups/evil", "service.lock/evil"]
+)
 def test_an_archive_writes_nowhere_else(name, tmp_path):
     (tmp_path / "x").write_text("x")
     with tarfile.open(tmp_path / "b.tar", "w") as tar:
@@ -286,19 +288,51 @@ def test_a_restore_clears_no_database_that_was_made_since(store, data, tmp_path)
 
 
 def test_backups_in_the_data_directory_are_not_in_the_next_one(store, data, tmp_path):
-    """In a container nothing else can be written to."""
+    """In a container nothing else can be written to, and nothing else be restored from."""
     add_done(store, data)
     expected = tree(data)
     for name in ("1.tar", "2.tar"):
         assert run(["backup", str(data / "backups" / name), "--data-dir", str(data)]) == 0
-    restore(data / "backups/2.tar", tmp_path / "new")
-    assert tree(tmp_path / "new") == expected
+    new = tmp_path / "new"
+    kept = {f"backups/{name}": content for name, content in tree(data / "backups").items()}
+    shutil.copytree(data / "backups", new / "backups")
+    write(new / ".restoring/machines/mine/1.json", "of a restore that was broken off")
+    for _ in range(2):
+        assert run(["restore", str(new / "backups/2.tar"), "--data-dir", str(new)]) == 0
+        assert tree(new) == expected | kept
+        shutil.rmtree(new / "jobs")
+        for file in new.glob("stillpath.sqlite3*"):
+            file.unlink()
+
+
+@pytest.mark.parametrize("name", ["b.tar", "jobs/b.tar", "backups"])
+def test_a_restore_never_deletes_its_archive(name, store, data, tmp_path, capsys):
+    back_up(data, tmp_path / "b.tar")
+    new = tmp_path / "new"
+    write(new / ".restoring/machines/mine/1.json", "of a restore that was broken off")
+    (new / name).parent.mkdir(exist_ok=True)
+    shutil.copy(tmp_path / "b.tar", new / name)
+    before = tree(new)
+    assert run(["restore", str(new / name), "--data-dir", str(new)]) == 2
+    assert str(new / "backups") in capsys.readouterr().err
+    assert tree(new) == before
+
+
+@pytest.mark.parametrize("left", [None, b"", b"scrambled" * 1000])
+def test_a_backup_without_its_jobs_is_refused(left, data, tmp_path, capsys):
+    """A night later the last good one may be deleted."""
+    write(data / "jobs/0123/source/part.gcode", "G28\n")
+    if left is not None:
+        (data / "stillpath.sqlite3").write_bytes(left)
+    assert run(["backup", str(tmp_path / "b.tar"), "--data-dir", str(data)]) == 2
+    assert "restore an earlier backup" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["data"]
 
 
 def test_refusals(store, data, tmp_path, monkeypatch, capsys):
     (tmp_path / "there.tar").write_text("mine")
-    for target in (tmp_path / "there.tar", data / "b.tar"):
-        assert run(["backup", str(target), "--data-dir", str(data)]) == 2
+    for target in ("there.tar", "data/b.tar", "data/backups", "no such folder/"):
+        assert run(["backup", f"{tmp_path}/{target}", "--data-dir", str(data)]) == 2
     assert run(["backup", str(tmp_path / "b.tar"), "--data-dir", str(tmp_path / "no")]) == 2
     assert (tmp_path / "there.tar").read_text() == "mine"
     monkeypatch.setenv("STILLPATH_DATABASE_URL", "postgresql://localhost/x")
