@@ -20,9 +20,10 @@ from dataclasses import dataclass, replace
 from sqlalchemy import Engine, and_, case, or_, select, update
 
 from stillpath.service.database.engine import reading, writing
-from stillpath.service.database.tables import deliveries
+from stillpath.service.database.tables import deliveries, jobs
+from stillpath.service.jobs.state import Job
 
-__all__ = ["Delivery", "bring_forward", "claim", "deliveries_of", "prolong", "settle"]
+__all__ = ["Delivery", "bring_forward", "claim", "deliveries_of", "overtaken", "prolong", "settle"]
 
 _AT_ONCE = 500
 
@@ -101,6 +102,27 @@ def claim(engine: Engine, *, now: float, until: float) -> tuple[Delivery, bool] 
     if not _changed(engine, before, after):
         return None  # another process was faster; try again next time
     return after, before.state == "sending"
+
+
+def overtaken(engine: Engine, job: Job) -> str | None:
+    """Return how far a later job is that brings the same printer a file of the same name.
+
+    Returns
+    -------
+    str or None
+        ``done``, ``sending``, or None: there is no such job, or it is not being sent.
+    """
+    row = deliveries.c
+    later = (
+        select(row.state)
+        .join(jobs, jobs.c.id == row.job_id)
+        .where(row.kind == "printer", row.target == job.printer)
+        .where(row.state.in_(("done", "sending")))
+        .where(jobs.c.result_name == job.result_name, jobs.c.created_at > job.created_at)
+        .order_by(row.state)
+    )
+    with reading(engine) as connection:
+        return connection.execute(later).scalars().first()
 
 
 def bring_forward(engine: Engine, *, waiting: Sequence[float], sending: float) -> None:

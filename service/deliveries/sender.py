@@ -75,7 +75,8 @@ class Sender:
     Every process of the service may have one; a claim on the row decides who sends what. What
     cannot be delivered is tried again after 5 s, 15 s, 45 s, ... 6 h, ten times in all. A webhook
     may arrive twice. An upload that shall start a print is never repeated unless the printer was
-    not reached: a second print could begin on top of the first.
+    not reached: a second print could begin on top of the first. What was submitted earlier never
+    replaces a later file of its name on a printer, however long it had to wait.
 
     Before a printer gets a file it is compared with the file's machine
     (`service.deliveries.checking`): what differs is noted, and where that makes a print unsafe, the
@@ -252,6 +253,14 @@ class Sender:
 
     def _send_to_printer(self, job: Job, name: str) -> tuple[str, str | None]:
         printer = printer_for(self._printers, name, start=job.print_after)
+        later = rows.overtaken(self._engine, job)
+        if later == "sending":
+            return "waiting", f"a later {job.result_name} is on its way to {name}"
+        if later == "done":
+            return "failed", (
+                f"{name} has a later {job.result_name} already, which this one would replace; "
+                "submit the file again to send it all the same"
+            )
         warnings, unsafe = self._looked_at(printer, job)
         # The age is unknown where a clock was set back.
         late = abs(time.time() - (job.finished_at or 0.0)) > self._times.start_within_s

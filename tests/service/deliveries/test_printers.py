@@ -14,7 +14,7 @@ import pytest
 from stillpath.service.deliveries import sender
 from stillpath.service.deliveries.http_requests import Reply
 from stillpath.service.deliveries.printers import PrinterFileError, load_printers, printer_for
-from stillpath.service.deliveries.rows import Delivery
+from stillpath.service.deliveries.rows import Delivery, claim, settle
 from stillpath.service.deliveries.targets import TargetRefused
 from stillpath.service.jobs.state import Job
 from tests.service.deliveries.listeners import Listener, Seen, moonraker, octoprint, until, uploads
@@ -84,6 +84,26 @@ def test_a_result_that_the_disk_has_damaged_goes_to_no_printer(tmp_path: Path, k
     assert delivery.state == "failed"
     assert "damaged; submit the file again" in (delivery.error or "")
     assert not uploads(server)
+
+
+def test_a_late_upload_replaces_no_later_file(tmp_path: Path):
+    """As after a printer was off: what was tried more often waits longer."""
+    with moonraker() as server, at(tmp_path, printer("p", "moonraker", server.url)) as place:
+        later = place.finish(tmp_path, printer="p", created_at=2000.0)
+        found = claim(place.engine, now=time.time(), until=time.time() + 60)
+        assert found is not None
+        earlier = place.finish(tmp_path, printer="p", created_at=1000.0)
+        other = place.finish(tmp_path, printer="p", created_at=1000.0, result_name="other.gcode")
+        with place.sending():
+            until(lambda: place.delivery(earlier).error)
+            assert "on its way" in (place.delivery(earlier).error or "")
+            assert place.settled(other).state == "done"
+            assert settle(place.engine, found[0], "waiting", next_at=0.0)
+            assert place.settled(later).state == "done"
+            delivery = place.settled(earlier)
+    assert delivery.state == "failed"
+    assert "has a later part.stillpath.gcode already" in (delivery.error or "")
+    assert len(uploads(server)) == 2
 
 
 def test_a_wrong_key_is_told_and_not_repeated(tmp_path: Path):
