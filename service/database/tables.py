@@ -19,6 +19,7 @@ from sqlalchemy import (
 )
 
 __all__ = [
+    "LONGEST_STAGE",
     "audit",
     "deliveries",
     "documents",
@@ -29,6 +30,8 @@ __all__ = [
     "seen_time",
     "submissions",
 ]
+
+LONGEST_STAGE = 64
 
 metadata = MetaData(
     naming_convention={
@@ -65,7 +68,7 @@ jobs = Table(
     Column("attempt", Integer, nullable=False, default=0),
     Column("losses", Integer, nullable=False, default=0),
     Column("worker", String(255)),
-    Column("stage", String(64), nullable=False),
+    Column("stage", String(LONGEST_STAGE), nullable=False),
     Column("progress", Float, nullable=False, default=0.0),
     Column("eta_s", Float),
     Column("problem", JSON(none_as_null=True)),

@@ -152,7 +152,10 @@ def settle(
     engine: Engine, claimed: Delivery, state: str, *, next_at: float, error: str | None = None
 ) -> bool:
     """Record the outcome of a claimed delivery; False: the claim is lost."""
-    text = None if error is None else error[:2000]
+    text = None
+    if error is not None:
+        # What receivers say may hold what databases refuse: half a character, and NUL.
+        text = error[:2000].encode(errors="replace").decode().replace("\0", "?")
     return _changed(engine, claimed, replace(claimed, state=state, next_at=next_at, error=text))
 
 

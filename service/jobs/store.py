@@ -305,6 +305,7 @@ class JobStore:
         The same as `apply` with `Progressed`, in one statement.
         """
         fraction = min(fraction, 1.0)
+        stage = stage[: tables.LONGEST_STAGE]  # it may hold the name of a file
         statement = (
             update(tables.jobs)
             .where(_JOBS.id == job_id, _JOBS.state == "running", _JOBS.attempt == attempt)

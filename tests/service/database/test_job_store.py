@@ -116,6 +116,15 @@ def test_a_beat_is_a_progress_in_one_statement(store: JobStore, sequence: list[E
         assert getattr(first, name) == getattr(second, name)
 
 
+def test_a_stage_with_the_name_of_a_file_is_cut(store: JobStore):
+    job = store.add(make_job())
+    run(store, job, 1500.0)
+    assert store.beat(job.id, 1, 1510.0, "reading " + 100 * "x" + ".csv", 0.0, None)
+    after = store.get(job.id)
+    assert after is not None
+    assert (after.stage, after.heartbeat_at) == ("reading " + 56 * "x", 1510.0)
+
+
 def test_what_is_silent(store: JobStore):
     early, late = (store.add(make_job()) for _ in range(2))
     store.add(make_job())

@@ -85,6 +85,30 @@ def test_it_is_given_up_in_the_end_and_says_why(tmp_path: Path):
     assert "503: come back tomorrow; given up after 3 attempts" in (delivery.error or "")
 
 
+@pytest.mark.parametrize(
+    "database", ["sqlite", pytest.param("postgresql", marks=pytest.mark.postgresql)]
+)
+def test_what_no_database_takes_is_kept_without(
+    database: str, request: pytest.FixtureRequest, tmp_path: Path
+):
+    """A receiver's text of which the outcome could not be written was sent to for ever."""
+    url = None if database == "sqlite" else request.getfixturevalue("postgres_url")
+    with (
+        Listener(lambda _: (410, {}, b"gone\0for good")) as listener,
+        listed(tmp_path, listener, database_url=url) as place,
+    ):
+        job = place.fail(webhook=listener.url)
+        with place.sending():
+            delivery = place.settled(job)
+        assert (delivery.state, len(listener.seen)) == ("failed", 1)
+        assert delivery.error == "answered with status 410: gone?for good"
+        half = place.fail(webhook=listener.url)
+        found = claim(place.engine, now=time.time(), until=time.time() + 60)
+        assert found is not None
+        assert settle(place.engine, found[0], "failed", next_at=0.0, error="half \ud83d")
+        assert place.delivery(half).error == "half ?"
+
+
 def test_a_redirect_is_not_followed(tmp_path: Path):
     with Listener() as other:
         for status, where in [
