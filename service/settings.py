@@ -42,11 +42,6 @@ def _listed(value: Any) -> Any:
         raise ValueError('is no list; write for instance a,b or ["a", "b"]') from None
 
 
-def _unless_empty(value: Any) -> Any:
-    """Take an empty variable, as Compose passes it on, for none."""
-    return None if value == "" else value
-
-
 def _is_long(secret: SecretStr | None) -> SecretStr | None:
     if secret is not None and len(secret) < _SHORTEST_SECRET:
         raise ValueError(
@@ -59,7 +54,6 @@ Network = Annotated[str, AfterValidator(_network)]
 # Without NoDecode, what is not JSON would be an error that names neither value nor remedy.
 Hosts = Annotated[list[str], NoDecode, BeforeValidator(_listed)]
 Networks = Annotated[list[Network], NoDecode, BeforeValidator(_listed)]
-Secret = Annotated[SecretStr | None, BeforeValidator(_unless_empty)]
 
 
 def _data_dir() -> Path:
@@ -72,6 +66,8 @@ def _data_dir() -> Path:
 
 class Settings(MachineSettings, BaseSettings):
     """Settings of one process of the service. In a variable a list is JSON, or ``a,b``.
+
+    An empty variable, as Compose and files of settings pass it on, counts as none.
 
     One computer needs none of the first three: SQLite, a folder, and worker processes of its own.
     With several, all three are elsewhere.
@@ -134,7 +130,9 @@ class Settings(MachineSettings, BaseSettings):
         Signs webhooks (HMAC-SHA256), with at least 16 characters; without it there are none.
     """
 
-    model_config = SettingsConfigDict(env_prefix=ENV_PREFIX, extra="forbid", frozen=True)
+    model_config = SettingsConfigDict(
+        env_prefix=ENV_PREFIX, env_ignore_empty=True, extra="forbid", frozen=True
+    )
 
     data_dir: Annotated[Path, Field(default_factory=_data_dir)]
     database_url: str | None = None
@@ -156,12 +154,12 @@ class Settings(MachineSettings, BaseSettings):
     requests_per_minute: Annotated[int, Field(ge=1)] = 1200
     keep_days: Annotated[float, Field(gt=0)] = 30.0
     keys: bool | None = None
-    first_key: Secret = None
+    first_key: SecretStr | None = None
     allowed_hosts: Hosts = []
     trusted_proxies: Networks = []
     printers: Path | None = None
     webhook_targets: Hosts = []
-    webhook_secret: Annotated[Secret, AfterValidator(_is_long)] = None
+    webhook_secret: Annotated[SecretStr | None, AfterValidator(_is_long)] = None
 
     @model_validator(mode="after")
     def _together(self) -> Self:

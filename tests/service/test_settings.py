@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import pytest
 
+from stillpath.applications.machines.settings import ENV_PREFIX, MachineSettings
 from stillpath.cli.own_machines import service_settings
 from stillpath.models.errors import ModelError
+from stillpath.service.settings import Settings
 
 
 @pytest.mark.parametrize(
@@ -48,9 +50,14 @@ def test_what_cannot_be_meant_is_named(
     assert "hunter2" not in str(caught.value)
 
 
-def test_an_empty_secret_is_none(monkeypatch: pytest.MonkeyPatch):
-    """Compose passes on an empty variable: nothing is signed with a key that everybody knows."""
-    for name in ("WEBHOOK_SECRET", "FIRST_KEY"):
-        monkeypatch.setenv(f"STILLPATH_{name}", "")
-    settings = service_settings()
-    assert (settings.webhook_secret, settings.first_key) == (None, None)
+def test_an_empty_variable_is_none(monkeypatch: pytest.MonkeyPatch):
+    """Compose passes some on: nothing is signed with a key that everybody knows, nothing is kept
+    in whatever folder the service was started in.
+    """
+    names = [f"{ENV_PREFIX}{field.upper()}" for field in Settings.model_fields]
+    for name in names:
+        monkeypatch.delenv(name, raising=False)
+    expected = service_settings(), MachineSettings.from_environment()
+    for name in names:
+        monkeypatch.setenv(name, "")
+    assert (service_settings(), MachineSettings.from_environment()) == expected
