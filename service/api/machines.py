@@ -234,7 +234,7 @@ def list_revisions(
     """Return who changed a machine when and why, and whether its resonances moved."""
     store = _store(request)
     with as_problems():
-        _check_own(name)
+        _check_own(store, name)
         history, approvals = store.history(name), store.approvals(name)
         return HistoryView(
             revisions=[RevisionView.of(r, approvals.get(r.number)) for r in history],
@@ -249,7 +249,7 @@ def show_revision(request: Request, name: Name, number: Number, _: Reader) -> Re
     """Return a state of a machine with its document."""
     store = _store(request)
     with as_problems():
-        _check_own(name)
+        _check_own(store, name)
         found = store.revision(name, number)
         return RevisionDocument(revision=_view(store, found), machine=found.machine)
 
@@ -265,7 +265,7 @@ def show_diff(
     """Return what revision `to` changed against `from`, in words and figures."""
     store = _store(request)
     with as_problems():
-        _check_own(name)
+        _check_own(store, name)
         old, new = store.revision(name, before), store.revision(name, after)
         return DiffView(before=before, after=after, changes=diff(old.machine, new.machine))
 
@@ -286,7 +286,7 @@ def approve_revision(
     """Approve a revision for use in jobs. An existing approval is kept."""
     store = _store(request)
     with as_problems():
-        _check_own(name)
+        _check_own(store, name)
         store.approve(name, number, author=author or caller.owner, message=message)
         found = store.revision(name, number)
         _note(request, caller, "approve", found)
@@ -353,7 +353,8 @@ def _changed(store: MachineStore, response: Response, made: Revision) -> Revisio
 def _expected(store: MachineStore, name: str, if_match: str | None) -> int:
     """Return the revision that a PUT is made on, 0 for a new machine; check its precondition."""
     with as_problems():
-        _check_own(name)
+        if name in builtin_machines():
+            raise _built_in(name)
         if name not in store:
             if if_match is not None:
                 raise _failed(f"There is no machine {name!r:.80}; add it without If-Match.")
@@ -373,7 +374,7 @@ def _check_state(store: MachineStore, name: str, if_match: str | None) -> int:
 
     Raise `Problem` 412 if `if_match` is given and names another state.
     """
-    _check_own(name)
+    _check_own(store, name)
     current = store.current(name)
     if if_match is not None and not matches(if_match, _etag(current.machine)):
         raise _failed(
@@ -383,14 +384,19 @@ def _check_state(store: MachineStore, name: str, if_match: str | None) -> int:
     return current.number
 
 
-def _check_own(name: str) -> None:
-    if name in builtin_machines():
-        raise Problem(
-            409,
-            "Built-in machine",
-            f"{name!r} is a built-in machine: it has no revisions and cannot be changed. PUT its "
-            "document under another name.",
-        )
+def _check_own(store: MachineStore, name: str) -> None:
+    """Refuse a built-in machine; a user may have one of a name that was built in later."""
+    if name in builtin_machines() and name not in store:
+        raise _built_in(name)
+
+
+def _built_in(name: str) -> Problem:
+    return Problem(
+        409,
+        "Built-in machine",
+        f"{name!r} is a built-in machine: it has no revisions and cannot be changed. PUT its "
+        "document under another name.",
+    )
 
 
 def _etag(machine: Machine) -> str:

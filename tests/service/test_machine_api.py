@@ -193,6 +193,24 @@ def test_the_list_shows_own_machines_and_damaged_ones(client: TestClient, folder
     assert_problem(client.post("/v1/jobs?machine=spoiled", content=b"G1 X1"), 422, "damaged")
 
 
+def test_a_user_s_machine_of_a_name_that_was_built_in_later(
+    client: TestClient, monkeypatch: pytest.MonkeyPatch
+):
+    """It is approved, looked at and deleted like any other, but not changed."""
+    with monkeypatch.context() as earlier:  # a version whose library had no such machine
+        for module in ("applications.machines.store", "service.api.machines"):
+            earlier.setattr(f"stillpath.{module}.builtin_machines", list)
+        where = "/v1/machines/ender3"
+        etag = put(client, make_machine("ender3"), where).headers["etag"]
+    assert client.post(f"{where}/revisions/1/approve").status_code == 200
+    [revision] = client.get(f"{where}/revisions").json()["revisions"]
+    assert revision["approval"]["author"] == "local"
+    assert client.get(f"{where}/revisions/1").status_code == 200
+    assert_problem(put(client, make_machine("ender3"), where, **{"If-Match": etag}), 409, "PUT its")
+    assert client.delete(where).status_code == 204
+    assert_problem(client.get(f"{where}/revisions"), 409, "built-in")
+
+
 @pytest.mark.slow
 def test_only_approved_revisions_where_that_is_switched_on(tmp_path: Path):
     with open_client(tmp_path, require_approval=True) as client:
