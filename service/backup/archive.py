@@ -29,6 +29,7 @@ from stillpath.models.document import Document
 from stillpath.pipeline.files import replacing, sync
 from stillpath.service.instance_lock import RESTORING, exclusive, is_half_restored
 from stillpath.service.permissions import private_folder
+from stillpath.service.storage.leftovers import delete_leftovers
 from stillpath.version import __version__
 
 __all__ = ["BackupError", "Manifest", "back_up", "restore"]
@@ -49,6 +50,8 @@ _DAMAGES = (
     *(EOFError, ValidationError, UnicodeError),
 )
 """What reading a damaged archive raises."""
+_WORK = ".stillpath-backup-"
+"""Beginning of the name of a folder beside the archive, for a copy of the database."""
 _CHUNK_BYTES = 1 << 20
 
 
@@ -96,9 +99,10 @@ def back_up(data_dir: Path, target: Path) -> Manifest:
             f"the database {database} is missing, and without it the files of jobs are not backed "
             "up; put it back, or restore an earlier backup"
         )
+    delete_leftovers(target.parent, f"{_WORK}*")
     with (
         replacing(target, mode=0o600) as temporary,
-        tempfile.TemporaryDirectory(dir=target.parent, prefix=".backup-") as work,
+        tempfile.TemporaryDirectory(dir=target.parent, prefix=_WORK) as work,
         tarfile.open(
             temporary, "w:gz" if target.name.endswith("gz") else "w", format=tarfile.PAX_FORMAT
         ) as tar,

@@ -96,6 +96,15 @@ def test_what_was_kept_comes_back(name, engine, store, data, tmp_path):
     assert jobs(tmp_path / "new") == dict.fromkeys(ids, JobState.DONE)
 
 
+def test_what_a_killed_backup_left_goes_with_the_next_one(store, data, tmp_path):
+    folders = [tmp_path / f"backups/.stillpath-backup-{name}" for name in ("killed", "at-work")]
+    for folder in folders:
+        write(folder / "stillpath.sqlite3", "a copy")
+    os.utime(folders[0], (0, 0))
+    back_up(data, tmp_path / "backups/b.tar")
+    assert {path.name for path in (tmp_path / "backups").iterdir()} == {"b.tar", folders[1].name}
+
+
 def test_running_jobs_can_be_taken_up(store, data, tmp_path):
     job = make_job()
     write(data / f"jobs/{job.id}/source/part.gcode", "G28\n")
