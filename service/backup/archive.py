@@ -147,7 +147,8 @@ def restore(source: Path, data_dir: Path) -> Manifest:
                     f"{data_dir} has a database beside a restore that was broken off there; move "
                     "it away, or name another folder with --data-dir"
                 )
-            _clear(data_dir)  # whatever else is here came from that restore
+            _check_untouched(data_dir)
+            _clear(data_dir)
         there = sorted(p.name for p in data_dir.iterdir() if p.name not in _STAYING)
         if there:
             raise BackupError(
@@ -362,6 +363,21 @@ def _is_in_backups(file: Path, data_dir: Path) -> bool:
             f"{file} lies in the data directory; name a file elsewhere, or in {data_dir / _BACKUPS}"
         )
     return True
+
+
+def _check_untouched(data_dir: Path) -> None:
+    """Refuse files that were made since a restore was broken off, such as machines.
+
+    Its own are older than its folder, which changed last when it moved something out.
+    """
+    broken_off_ns = (data_dir / RESTORING).stat().st_mtime_ns
+    for path in sorted(_below(data_dir)):
+        name = path.relative_to(data_dir)
+        if name.parts[0] not in _STAYING and path.stat().st_mtime_ns > broken_off_ns:
+            raise BackupError(
+                f"{data_dir} has files that were made since a restore was broken off there "
+                f"({name}); move them away, or name another folder with --data-dir"
+            )
 
 
 def _clear(data_dir: Path) -> None:

@@ -8,6 +8,7 @@ import random
 import shutil
 import tarfile
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -284,14 +285,23 @@ def test_a_restore_that_was_killed_begins_anew(step, store, data, tmp_path, monk
     assert not (new / ".restoring").exists()
 
 
-def test_a_restore_clears_no_database_that_was_made_since(store, data, tmp_path):
-    """As by a service that was started after a restore was broken off."""
+@pytest.mark.parametrize("made", ["database", "machine"])
+def test_a_restore_clears_nothing_that_was_made_since(made, store, data, tmp_path):
+    """As by a service, or the command line, after a restore was broken off."""
     back_up(data, tmp_path / "b.tar")
     new = tmp_path / "new"
-    open_database(Settings(data_dir=new)).dispose()
+    if made == "database":
+        open_database(Settings(data_dir=new)).dispose()
     write(new / ".restoring/machines/mine/1.json", "{}")
+    if made == "machine":
+        write(new / ".restoring/printers/left/1.json", "{}")
+        (new / ".restoring/machines").rename(new / "machines")
+        measured = new / "machines/measured/1.json"
+        write(measured, "{}")
+        later_s = time.time() + 1.0  # file systems tell times of some milliseconds only
+        os.utime(measured, (later_s, later_s))
     before = tree(new)
-    with pytest.raises(BackupError, match="move it away"):
+    with pytest.raises(BackupError, match=r"move (it|them) away"):
         restore(tmp_path / "b.tar", new)
     assert tree(new) == before
 
