@@ -22,6 +22,7 @@ from sqlalchemy.exc import (
     DatabaseError,
     DBAPIError,
     InterfaceError,
+    InternalError,
     OperationalError,
 )
 from sqlalchemy.exc import TimeoutError as PoolTimeout
@@ -64,6 +65,8 @@ _WRITE_QUEUE: deque[_PendingWrite] = deque()
 """Pending writes of `write_together`."""
 # Advisory lock for schema changes; a number not used otherwise in the database.
 _MIGRATION_LOCK = 0x57111_0000
+_READ_ONLY = "25006"
+"""PostgreSQL's code of a server that takes no writes: a standby, or one whose disk is full."""
 _ON_POSTGRESQL: dict[str, Any] = {
     # A server that vanished is noticed before a worker counts as lost.
     "connect_timeout": 5,
@@ -403,8 +406,11 @@ def _write_lock(engine: Engine) -> Iterator[None]:
 def _translate_errors(engine: Engine) -> Iterator[None]:
     try:
         yield
-    except (OperationalError, InterfaceError, PoolTimeout) as error:
-        if getattr(getattr(error, "orig", None), "sqlite_errorcode", None) == sqlite3.SQLITE_FULL:
+    except (OperationalError, InterfaceError, InternalError, PoolTimeout) as error:
+        original = getattr(error, "orig", None)
+        if isinstance(error, InternalError) and getattr(original, "sqlstate", None) != _READ_ONLY:
+            raise  # a bug of ours
+        if getattr(original, "sqlite_errorcode", None) == sqlite3.SQLITE_FULL:
             raise DatabaseFull(
                 f"the disk of the database {_shown(engine)} is full; make room on it"
             ) from error

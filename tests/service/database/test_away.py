@@ -47,6 +47,19 @@ def test_postgresql_comes_back(server: PostgresServer, tmp_path: Path, how: sign
     engine.dispose()
 
 
+@pytest.mark.postgresql
+def test_postgresql_that_takes_no_writes(postgres_url: str, tmp_path: Path):
+    """As a standby after a change of the server, or a hosted one whose disk is full."""
+    open_database(Settings(data_dir=tmp_path, database_url=postgres_url)).dispose()
+    url = f"{postgres_url}?options=-c%20default_transaction_read_only%3Don"
+    engine = open_database(Settings(data_dir=tmp_path, database_url=url))
+    store = JobStore(engine)
+    with pytest.raises(DatabaseAway, match="read-only transaction"):
+        store.add(make_job())
+    assert store.counts()[JobState.QUEUED] == 0
+    engine.dispose()
+
+
 def test_sqlite_that_is_damaged(tmp_path: Path):
     engine = open_database(Settings(data_dir=tmp_path))
     store = JobStore(engine)
