@@ -104,8 +104,10 @@ def claim(engine: Engine, *, now: float, until: float) -> tuple[Delivery, bool] 
     return after, before.state == "sending"
 
 
-def overtaken(engine: Engine, job: Job) -> str | None:
+def overtaken(engine: Engine, claimed: Delivery, job: Job) -> str | None:
     """Return how far a later job is that brings the same printer a file of the same name.
+
+    Later by its time and by its delivery's number: of a clock that was set back, one is wrong.
 
     Returns
     -------
@@ -116,7 +118,7 @@ def overtaken(engine: Engine, job: Job) -> str | None:
     later = (
         select(row.state)
         .join(jobs, jobs.c.id == row.job_id)
-        .where(row.kind == "printer", row.target == job.printer)
+        .where(row.kind == "printer", row.target == claimed.target, row.id > claimed.id)
         .where(row.state.in_(("done", "sending")))
         .where(jobs.c.result_name == job.result_name, jobs.c.created_at > job.created_at)
         .order_by(row.state)

@@ -233,6 +233,9 @@ class Sender:
         try:
             if claimed.kind == "webhook":
                 return _judged(self._send_webhook(claimed, job))
+            later = rows.overtaken(self._engine, claimed, job)
+            if later is not None:
+                return _outdated(claimed, job, later)
             return self._send_to_printer(job, claimed.target)
         except TargetRefused as error:
             return "failed", str(error)
@@ -253,14 +256,6 @@ class Sender:
 
     def _send_to_printer(self, job: Job, name: str) -> tuple[str, str | None]:
         printer = printer_for(self._printers, name, start=job.print_after)
-        later = rows.overtaken(self._engine, job)
-        if later == "sending":
-            return "waiting", f"a later {job.result_name} is on its way to {name}"
-        if later == "done":
-            return "failed", (
-                f"{name} has a later {job.result_name} already, which this one would replace; "
-                "submit the file again to send it all the same"
-            )
         warnings, unsafe = self._looked_at(printer, job)
         # The age is unknown where a clock was set back.
         late = abs(time.time() - (job.finished_at or 0.0)) > self._times.start_within_s
@@ -342,6 +337,16 @@ def _judged(reply: Reply) -> tuple[str, str | None]:
     if 300 <= reply.status < 400:
         return "failed", f"answered with status {reply.status}; redirects are not followed"
     return ("failed" if reply.status in _PERMANENT_STATUSES else "waiting"), error
+
+
+def _outdated(claimed: Delivery, job: Job, later: str) -> tuple[str, str]:
+    """Return the outcome for a file that a `later` one overtook: done, or still being sent."""
+    if later == "sending":
+        return "waiting", f"a later {job.result_name} is on its way to {claimed.target}"
+    return "failed", (
+        f"{claimed.target} has a later {job.result_name} already, which this one would replace; "
+        "submit the file again to send it all the same"
+    )
 
 
 def _unknown(why: str) -> str:

@@ -89,21 +89,26 @@ def test_a_result_that_the_disk_has_damaged_goes_to_no_printer(tmp_path: Path, k
 def test_a_late_upload_replaces_no_later_file(tmp_path: Path):
     """As after a printer was off: what was tried more often waits longer."""
     with moonraker() as server, at(tmp_path, printer("p", "moonraker", server.url)) as place:
-        later = place.finish(tmp_path, printer="p", created_at=2000.0)
-        found = claim(place.engine, now=time.time(), until=time.time() + 60)
-        assert found is not None
         earlier = place.finish(tmp_path, printer="p", created_at=1000.0)
-        other = place.finish(tmp_path, printer="p", created_at=1000.0, result_name="other.gcode")
+        later = place.finish(tmp_path, printer="p", created_at=2000.0)
+        until_s = time.time() + 60
+        claims = [claim(place.engine, now=time.time(), until=until_s) for _ in range(2)]
+        of_earlier, of_later = (found[0] for found in claims if found)
+        assert settle(place.engine, of_earlier, "waiting", next_at=0.0)
+        others = [
+            place.finish(tmp_path, printer="p", created_at=1000.0, result_name="other.gcode"),
+            place.finish(tmp_path, printer="p", created_at=500.0),  # the clock was set back
+        ]
         with place.sending():
             until(lambda: place.delivery(earlier).error)
             assert "on its way" in (place.delivery(earlier).error or "")
-            assert place.settled(other).state == "done"
-            assert settle(place.engine, found[0], "waiting", next_at=0.0)
+            assert [place.settled(job).state for job in others] == ["done", "done"]
+            assert settle(place.engine, of_later, "waiting", next_at=0.0)
             assert place.settled(later).state == "done"
             delivery = place.settled(earlier)
     assert delivery.state == "failed"
     assert "has a later part.stillpath.gcode already" in (delivery.error or "")
-    assert len(uploads(server)) == 2
+    assert len(uploads(server)) == 3
 
 
 def test_a_wrong_key_is_told_and_not_repeated(tmp_path: Path):
