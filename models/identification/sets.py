@@ -6,11 +6,13 @@ measurements.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import date
 
 import numpy as np
+from pydantic import ValidationError
 
 from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
@@ -217,11 +219,18 @@ def plant_set_from(
 
 
 def model_file_set(spec: PlantSpec) -> PlantSetSpec:
-    """Return the set of a plant that was not measured here but read from a file."""
+    """Return the set of a plant that was not measured here but read from a file.
+
+    It is varied as far as it can be: taps have no frequencies, and pairs that hardly ring no more
+    damping.
+    """
     kind: Kind = "model file"
-    return PlantSetSpec(
-        nominal=spec, members=parametric_members(kind), provenance=Provenance(kind=kind)
-    )
+    alone = PlantSetSpec(nominal=spec, provenance=Provenance(kind=kind))
+    every = parametric_members(kind)
+    for members in (every, ParametricMembers(frequency_scale=every.frequency_scale)):
+        with contextlib.suppress(ValidationError):
+            return PlantSetSpec.model_validate({**dict(alone), "members": members})
+    return alone
 
 
 def parametric_members(kind: Kind) -> ParametricMembers:
