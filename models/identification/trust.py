@@ -27,6 +27,8 @@ __all__ = [
 _LEAST_SHARE, _LEAST_COUNT = 0.1, 30
 _PRINTERS_HZ = 150.0
 """Printers have their modes below this frequency: a model need not follow above it."""
+_MAIN_HZ = (1.0, 500.0)
+"""As for a resonance that is typed in."""
 _MOST_UNSURE = 0.05
 """Relative standard deviation of the frequency of the mode that rings most."""
 _MOST_LEVEL = 2.0
@@ -56,7 +58,7 @@ def check_informative(
     ------
     ModelError
         If hardly any frequency is coherent, or the mode that rings most lies outside of what was
-        measured or might be anywhere.
+        measured, is no printer's, or might be anywhere.
     """
     names = ", ".join(sources)
     for one in measured:
@@ -73,6 +75,12 @@ def check_informative(
             f"measured {low:.1f} to {high:.1f} Hz, so it was not measured. "
             + "".join(f"And: {warning}. " for warning in warnings)
             + _MEASURE
+        )
+    if not _MAIN_HZ[0] <= main.f_hz <= _MAIN_HZ[1]:
+        raise ModelError(
+            f"{names}: the mode that rings most would be at {main.f_hz:.3g} Hz; that of a printer "
+            f"lies between {_MAIN_HZ[0]:g} and {_MAIN_HZ[1]:g} Hz: frequencies must be in Hz (not "
+            "kHz or rad/s), and times in seconds"
         )
     # Modes of a spectrum trade places with each other; its set knows how far it can be trusted.
     if not fit.magnitude_only and not main_mode_known(fit):

@@ -205,6 +205,13 @@ def test_a_response_that_may_not_be_1_at_low_frequency(gain: float) -> None:
     )
 
 
+@pytest.mark.parametrize("unit", [1e-3, 60.0])
+def test_frequencies_that_are_not_in_hz(unit: float) -> None:
+    plain = response(one_mode(40.0, 0.05))
+    with pytest.raises(ModelError, match=r"frequencies must be in Hz \(not kHz"):
+        identify([at(replace(plain, f_hz=unit * plain.f_hz))])
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("power", [-2, 1])
 def test_command_and_measurement_of_different_kinds(power: int) -> None:
