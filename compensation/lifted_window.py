@@ -117,7 +117,8 @@ def lifted_window(
     Raises
     ------
     DesignError
-        For an empty set, weights that do not fit, an unstable member, or update > window.
+        For an empty set, weights that do not fit, an unstable member, plants that answer later than
+        the window, or update > window.
     """
     share = checked_weights(weights, len(plants))
     if not 2 <= update <= window:
@@ -127,6 +128,11 @@ def lifted_window(
     roots = np.sqrt(share)
     markov = np.array([integrated(p.impulse_response(window)) for p in plants])
     u, s, vt = np.linalg.svd(roots[:, None] * markov, full_matrices=False)
+    if s[0] == 0.0:
+        raise DesignError(
+            f"no plant answers within the preview of {window} samples: leave a delay that both "
+            "axes share out of the model, and measure an axis again that alone is so late"
+        )
     count = int(np.sum(s > _TOLERANCE * s[0]))
     # The sign of singular vectors is arbitrary; fix it so that the same model gives the same bytes.
     sign = np.sign(vt[np.arange(len(s)), np.argmax(np.abs(vt), axis=1)])
