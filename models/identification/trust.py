@@ -64,6 +64,7 @@ def check_informative(
     for one in measured:
         _check_coherent(one, names)
     low, high = fit.band_hz
+    told = "".join(f"And: {warning}. " for warning in warnings)
     # In a spectrum, modes beyond the band only shape its flank.
     seen = [m for m in fit.modes if low <= m.f_hz <= high] if fit.magnitude_only else []
     main = max(seen or fit.modes, key=lambda m: m.peak, default=None)
@@ -73,8 +74,7 @@ def check_informative(
         raise ModelError(
             f"{names}: the mode that rings most would be at {main.f_hz:.1f} Hz, outside the "
             f"measured {low:.1f} to {high:.1f} Hz, so it was not measured. "
-            + "".join(f"And: {warning}. " for warning in warnings)
-            + _MEASURE
+            f"{told}{_MEASURE}"
         )
     if not _MAIN_HZ[0] <= main.f_hz <= _MAIN_HZ[1]:
         raise ModelError(
@@ -87,7 +87,7 @@ def check_informative(
         raise ModelError(
             f"{names}: the mode that rings most is at {main.f_hz:.1f} Hz, give or take "
             f"{2 * main.f_sd_hz:.1f} Hz; it must be known within {2 * _MOST_UNSURE:.0%} to be "
-            f"compensated. {_MEASURE}"
+            f"compensated. {told}{_MEASURE}"
         )
 
 
