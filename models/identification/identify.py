@@ -44,6 +44,7 @@ from stillpath.models.identification.messages import (
     phase_warning,
     poorly_explained,
     scale_warnings,
+    unvaried_notes,
 )
 from stillpath.models.identification.modal_fit import refit
 from stillpath.models.identification.nozzle import Frame, frame_of
@@ -92,10 +93,6 @@ __all__ = ["Measured", "Progress", "identify"]
 Progress: TypeAlias = Callable[[str, float], None]
 """Called with what is being done and how much of all is done, 0 to 1."""
 
-_ALONE = (
-    "the model's frequencies cannot be varied, so commands are designed for it alone, as if it "
-    "were exact; give its modes, or zeros and poles"
-)
 _SENSOR_AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 _KINDS: dict[type, Kind] = {
     AccelerationLog: "raw log",
@@ -269,8 +266,7 @@ class _AxisWork:
         if plants.provenance is not None:
             about = plants.provenance.model_copy(update={"sources": self._origin.sources})
             plants = plants.model_copy(update={"provenance": about})
-        notes = () if plants.members else (_ALONE,)
-        return AxisIdentification(axis=self._axis, plants=plants, notes=notes)
+        return AxisIdentification(axis=self._axis, plants=plants, notes=unvaried_notes(plants))
 
     def _from_responses(self) -> AxisIdentification:
         responses = [(self._response(m), m.condition) for m in self._used]
