@@ -114,10 +114,11 @@ def unvaried_notes(plants: PlantSetSpec) -> tuple[str, ...]:
     """Say of a model from a file that it has no members."""
     if plants.members:
         return ()
-    return (
+    note = (
         "the model's frequencies cannot be varied, so commands are designed for it alone, as if it "
-        "were exact; give its modes, or zeros and poles",
+        "were exact; give its modes, or zeros and poles"
     )
+    return (note,)
 
 
 def parted(told: Iterable[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
