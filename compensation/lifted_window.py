@@ -117,21 +117,16 @@ def lifted_window(
     Raises
     ------
     DesignError
-        For an empty set, weights that do not fit, an unstable member, or update > window.
+        For an empty set, weights that do not fit, an unstable member, plants that answer later than
+        the window, or update > window.
     """
     share = checked_weights(weights, len(plants))
     if not 2 <= update <= window:
         raise DesignError(f"update of {update} samples: between 2 and the window's {window} needed")
     for j, plant in enumerate(plants):
         check_stable(plant, f"plant {j} of the set")
-    roots = np.sqrt(share)
     markov = np.array([integrated(p.impulse_response(window)) for p in plants])
-    u, s, vt = np.linalg.svd(roots[:, None] * markov, full_matrices=False)
-    count = int(np.sum(s > _TOLERANCE * s[0]))
-    # The sign of singular vectors is arbitrary; fix it so that the same model gives the same bytes.
-    sign = np.sign(vt[np.arange(len(s)), np.argmax(np.abs(vt), axis=1)])
-    mix = (u * sign)[:, :count].T * roots
-    components = (s * sign)[:count, None] * vt[:count]
+    mix, components = _components(markov, np.sqrt(share))
 
     zeros = np.zeros(window)
     step = np.arange(1.0, window + 1.0)
@@ -210,6 +205,27 @@ def condensed(lifted: LiftedWindow) -> Condensed:
         np.concatenate([outputs.reshape(*free.shape[:2], -1), ends], axis=2),
         squeeze @ lifted.reach,
     )
+
+
+def _components(markov: Array, roots: Array) -> tuple[Array, Array]:
+    """Return the mix of every component, and the components' own responses.
+
+    Parameters
+    ----------
+    markov : ndarray, shape (plants, window)
+    roots : ndarray, shape (plants,)
+        Square roots of the weights.
+    """
+    u, s, vt = np.linalg.svd(roots[:, None] * markov, full_matrices=False)
+    if s[0] == 0.0:
+        raise DesignError(
+            f"no plant answers within the preview of {markov.shape[1]} samples: leave a delay that "
+            "both axes share out of the model, and measure an axis again that alone is so late"
+        )
+    count = int(np.sum(s > _TOLERANCE * s[0]))
+    # The sign of singular vectors is arbitrary; fix it so that the same model gives the same bytes.
+    sign = np.sign(vt[np.arange(len(s)), np.argmax(np.abs(vt), axis=1)])
+    return (u * sign)[:, :count].T * roots, (s * sign)[:count, None] * vt[:count]
 
 
 def _reach(plant: DiscretePlant, samples: int) -> Array:

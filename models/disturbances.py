@@ -149,10 +149,7 @@ def sample(
 def _tones(tones: tuple[Tone, ...], t: Array, dt_s: float) -> Array:
     out = np.zeros(len(t))
     for tone in tones:
-        if 2 * tone.f_hz * dt_s >= 1:
-            raise ModelError(
-                f"tone of {tone.f_hz:g} Hz: not below half the sampling rate, {0.5 / dt_s:g} Hz"
-            )
+        _check_sampled("tone", tone.f_hz, dt_s)
         out += tone.amplitude * np.sin(2 * np.pi * tone.f_hz * t + tone.phase_rad)
     return out
 
@@ -172,10 +169,20 @@ def _coloured(spec: Wideband, samples: int, dt_s: float, generator: np.random.Ge
     f = np.fft.rfftfreq(samples, dt_s)
     out = spec.floor_rms * generator.standard_normal(samples)
     for peak in spec.peaks:
+        _check_sampled("hump", peak.f_hz, dt_s)
+        # A narrower hump may lie between two frequencies, and have no power.
+        width_hz = max(peak.width_hz, 1.0 / (samples * dt_s))
         # Half the power density at half the width off the centre.
-        shape = np.exp(-2 * np.log(2) * ((f - peak.f_hz) / peak.width_hz) ** 2)
+        shape = np.exp(-2 * np.log(2) * ((f - peak.f_hz) / width_hz) ** 2)
         spectrum = shape * np.fft.rfft(generator.standard_normal(samples))
         hump = np.fft.irfft(spectrum, samples)
         power = float(np.sum(shape**2 * np.where((f > 0) & (f < 0.5 / dt_s), 2, 1)) / samples)
         out += peak.rms * hump / math.sqrt(power)
     return out
+
+
+def _check_sampled(what: str, f_hz: float, dt_s: float) -> None:
+    if 2 * f_hz * dt_s >= 1:
+        raise ModelError(
+            f"{what} of {f_hz:g} Hz: not below half the sampling rate, {0.5 / dt_s:g} Hz"
+        )

@@ -88,10 +88,12 @@ def plan_file(
     Raises
     ------
     GcodeError
-        The file cannot be read as G-code of this machine, or moves nothing.
+        The file cannot be read as G-code of this machine, moves nothing, or is `target_npz`.
     """
     if not (np.isfinite(rate_hz) and 0 < rate_hz <= 100_000):
         raise GcodeError(f"the rate of {rate_hz:g} samples per second is outside 0 to 100000")
+    if target_npz.exists() and target_npz.samefile(source):
+        raise GcodeError(f"{target_npz} is the file that is read; name another one to write")
     motion = FileMotion(source, plate, machine, dialect, 1.0 / rate_hz, progress)
     with npz_table(target_npz, dict.fromkeys(_COLUMNS, "<f8")) as table:
         for part in motion:

@@ -31,6 +31,22 @@ def test_what_is_public_is_there_and_told() -> None:
         stillpath.compensator  # noqa: B018
 
 
+def test_a_motion_does_not_take_the_place_of_its_print(tmp_path: Path) -> None:
+    source, link = tmp_path / "part.gcode", tmp_path / "motion.npz"
+    source.write_text("G28\nG1 X10 Y10 F3000\n")
+    link.symlink_to(source)
+    for target in (source, link):
+        with pytest.raises(stillpath.GcodeError, match="is the file that is read"):
+            stillpath.plan(source, target, "ender3")
+    assert source.read_text() == "G28\nG1 X10 Y10 F3000\n"
+
+
+@pytest.mark.parametrize("kind", [str, Path])
+def test_one_measurement_needs_no_list(kind: type, tmp_path: Path) -> None:
+    with pytest.raises(stillpath.ModelError, match=r"cannot read .*lost\.csv"):
+        stillpath.identify(kind(tmp_path / "lost.csv"), "ender3", name="mine")
+
+
 def test_rooms_are_imported_below_stillpath_only() -> None:
     package = ROOT / "src" / "stillpath"
     layers = [path.name for path in package.iterdir() if path.is_dir() and path.name[0] != "_"]

@@ -17,6 +17,7 @@ from stillpath.applications.identification.figures import (
     SpectrumFigures,
     TrialFigures,
 )
+from stillpath.applications.machines.resonances import resonances
 from stillpath.models.arrays import Array
 from stillpath.models.identification.prediction import predicted_psd, predicted_spectrum
 from stillpath.models.identification.readers import ReadSettings, direction_of, excitation_for
@@ -31,7 +32,7 @@ from stillpath.models.identification.types import (
     Spectrum,
 )
 from stillpath.models.machine import Machine
-from stillpath.models.plants import PlantSpec, continuous, frequency_response
+from stillpath.models.plants import PlantSpec, frequency_response
 from stillpath.models.provenance import MeasuredMode, SourceFile
 from stillpath.version import __version__
 
@@ -119,8 +120,7 @@ def _axis(
 def _modes(plant: PlantSpec, fit: Fit | None) -> tuple[MeasuredMode, ...]:
     if fit is not None:
         return measured_modes(fit)
-    rows = continuous(plant).modes()
-    return tuple(MeasuredMode(f_hz=float(f), zeta=float(z)) for f, z in rows)
+    return tuple(MeasuredMode(f_hz=f, zeta=zeta) for f, zeta in resonances(plant))
 
 
 def _curve(plant: PlantSpec, f: Array) -> ModelCurve:

@@ -7,14 +7,17 @@ from dataclasses import dataclass
 
 from pydantic import ValidationError
 
-from stillpath.applications.identification.run import read_inputs
+from stillpath.applications.identification.run import LARGEST_BYTES, read_inputs
 from stillpath.models.errors import ModelError
+from stillpath.models.identification.readers.compressed import unpacked
+from stillpath.models.identification.readers.tables import check_size
 from stillpath.models.identification.ripple import RippleLearning, WaveBasis
 from stillpath.models.identification.ripple_passes import learn_machine_ripple, read_pass
 from stillpath.models.machine import Machine
 from stillpath.models.provenance import SourceFile
 from stillpath.models.ripple import RippleAxis, RippleSide
 from stillpath.models.store import explain
+from stillpath.models.user_files import as_utf8
 
 __all__ = ["LearntRipple", "learn_from_files", "parse_basis"]
 
@@ -120,8 +123,10 @@ def parse_basis(text: str) -> WaveBasis:
 
 
 def _text(content: bytes, name: str) -> str:
+    content = as_utf8(unpacked(content, name, LARGEST_BYTES))
+    check_size(content, name)
     try:
-        return content.decode("utf-8-sig")
+        return content.decode()
     except UnicodeDecodeError as error:
         raise ModelError(f"{name}: not text (byte {error.start}); a pass is a table") from None
 

@@ -20,7 +20,7 @@ from stillpath.models.identification.identify import Measured, Progress, identif
 from stillpath.models.identification.readers import ReadSettings, read_content
 from stillpath.models.identification.types import AxisIdentification
 from stillpath.models.machine import Machine
-from stillpath.models.plants import PlantSpec
+from stillpath.models.plants import PlantSpec, discretise
 from stillpath.models.provenance import SourceFile
 from stillpath.models.schedule import AxisSchedule, MassSchedule, resonances_hz
 from stillpath.models.store import explain
@@ -29,6 +29,7 @@ from stillpath.models.user_files import read_bytes
 __all__ = ["Identified", "InputFile", "identify_files", "read_inputs"]
 
 LARGEST_BYTES = 200_000_000
+_DT_S = 1e-3
 Axis: TypeAlias = Literal["x", "y"]
 
 
@@ -109,9 +110,21 @@ def identify_files(
         measured, settings, sources=sources, max_order=max_order, progress=progress
     )
     found = {axis: _with_what_is_known(base, axis, one) for axis, one in identified.items()}
+    for axis, one in found.items():
+        _check_sampled(axis, one.plants.nominal)
     machine = _with_plants(base, found, name, title)
     report = identification_report(machine, base, found, settings, sources)
     return Identified(machine, report)
+
+
+def _check_sampled(axis: Axis, plant: PlantSpec) -> None:
+    """Refuse a model that no command can be designed for, before it is stored."""
+    try:
+        discretise(plant, _DT_S)
+    except ModelError as error:
+        raise ModelError(
+            f"axis {axis.upper()}: commands have a sample every {_DT_S * 1e3:g} ms, and {error}"
+        ) from None
 
 
 def _read_input(argument: str) -> InputFile:

@@ -25,7 +25,7 @@ from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.hatches import Hatches, ScanSamples, Timing, read_hatches, sample_hatches
 from stillpath.models.arrays import Array
 from stillpath.models.diagrams import Block
-from stillpath.models.disturbances import DisturbanceSpec, sample
+from stillpath.models.disturbances import DisturbanceSpec, SensorSpec, sample
 from stillpath.models.loops import Loop, LoopSpec
 from stillpath.simulation.closed_loop import simulate
 from stillpath.simulation.scanning import TrackErrors, track_errors
@@ -107,6 +107,7 @@ def scan_file(
     loop = spec.nominal()
     scale = _scale(spec, settings)
     _check_controller(controller, spec)
+    sensor = _in_um(spec.sensor, scale)
     hatches = read_hatches(_text(source))
     samples, rows = _numbered(sample_hatches(hatches, loop.dt_s, settings.timing), hatches)
     wanted = 1e3 * samples.xy_mm
@@ -114,12 +115,12 @@ def scan_file(
     command = np.array([prefilter.apply(axis) for axis in wanted])
     warm_up = 0 if controller is None else min(controller.settling, _LONGEST_WARM_UP)
     disturbed = _disturbance(loop, spec, settings, controller, warm_up + wanted.shape[1], scale)
-    plain = _Drive(loop, spec, (), 1, disturbed, warm_up)
+    plain = _Drive(loop, sensor, (), 1, disturbed, warm_up)
     outputs = {"sent": ("as sent", plain.run(wanted, wanted))}
     if settings.prefilter != "none":
         outputs["prefilter"] = (prefilter.label, plain.run(command, wanted))
     if controller is not None:
-        added = _Drive.with_controller(loop, spec, controller, disturbed, warm_up)
+        added = _Drive.with_controller(loop, sensor, controller, disturbed, warm_up)
         label = f"{prefilter.label} and {controller.method}".removeprefix("none and ")
         outputs["add-on"] = (label, added.run(command, wanted))
     errors = {
@@ -201,27 +202,27 @@ class _Drive:
     def __init__(
         self,
         loop: Loop,
-        spec: LoopSpec,
+        sensor: SensorSpec | None,
         blocks: Sequence[Block],
         every: int,
         disturbed: _Disturbed | None,
         warm_up: int,
     ) -> None:
-        self._loop, self._spec, self._blocks = loop, spec, blocks
+        self._loop, self._sensor, self._blocks = loop, sensor, blocks
         self._every, self._disturbed, self._warm_up = every, disturbed, warm_up
 
     @classmethod
     def with_controller(
         cls,
         loop: Loop,
-        spec: LoopSpec,
+        sensor: SensorSpec | None,
         controller: LoadedController,
         disturbed: _Disturbed | None,
         warm_up: int,
     ) -> _Drive:
         """Return the loop with an add-on as a controller would load it."""
         blocks = _expecting(controller.blocks, loop, controller.every)
-        return cls(loop, spec, blocks, controller.every, disturbed, warm_up)
+        return cls(loop, sensor, blocks, controller.every, disturbed, warm_up)
 
     def run(self, reference: Array, wanted: Array) -> Array:
         """Return the output, shape (2, n), of a machine at rest at the start of the path."""
@@ -234,9 +235,7 @@ class _Drive:
         if self._disturbed is not None:
             place = "d_out" if self._disturbed.enters == "output" else "d_in"
             inputs[place] = np.repeat(self._disturbed.d_um, self._every)
-        y = simulate(self._loop, self._blocks, inputs, every=self._every, sensor=self._spec.sensor)[
-            "y"
-        ]
+        y = simulate(self._loop, self._blocks, inputs, every=self._every, sensor=self._sensor)["y"]
         return y[:: self._every][self._warm_up :]
 
 
@@ -277,6 +276,11 @@ def _scale(spec: LoopSpec, settings: ScanSettings) -> float:
     return scale
 
 
+def _in_um(sensor: SensorSpec | None, scale: float) -> SensorSpec | None:
+    """Return the sensor as the prediction sees it, whose signals are in um."""
+    return sensor and sensor.model_copy(update={"quantum": scale * sensor.quantum})
+
+
 def _text(source: Path) -> str:
     size = source.stat().st_size
     if size > _LARGEST_FILE:
@@ -314,7 +318,8 @@ def _disturbance(
     kind, enters = disturbance_of(controller.options, loop)
     enters = settings.enters or enters
     d = sample(kind, count, loop.dt_s, generator)
-    left = answer(loop, (), d, enters, sensor=spec.sensor)["y"]
+    # Of size 1, which says nothing of what the sensor resolves.
+    left = answer(loop, (), d, enters, sensor=_in_um(spec.sensor, 0.0))["y"]
     rms = float(np.sqrt(np.mean(left[count // 4 :] ** 2)))
     if rms == 0:
         raise DesignError("the controller's disturbance does not reach the output; give another")

@@ -52,7 +52,8 @@ class Lateness:
     Attributes
     ----------
     late_s : ndarray, shape (bands,)
-        Against a test that begins with the log, by band. The sensor's delay is in it.
+        Against a test that begins with the log, by band; NaN where nothing was measured. The
+        sensor's delay is in it.
     interval_s : float
         Between samples: the log begins anywhere within one of them after the test.
     whole : bool
@@ -122,9 +123,11 @@ def timed(
 
 def _agreeing(logs: Sequence[Lateness]) -> list[Lateness]:
     """Return the logs near their median; none if most are elsewhere."""
+    # Above a stiff axis's peak the test may have ended before the last band.
+    logs = [one for one in logs if np.count_nonzero(np.isfinite(one.late_s)) >= _ALIKE]
     if not logs:
         return []
-    whole_s = np.array([np.median(one.late_s) for one in logs])
+    whole_s = np.array([np.nanmedian(one.late_s) for one in logs])
     close = np.abs(whole_s - np.median(whole_s)) <= _AGREE_S
     near = [one for one, is_near in zip(logs, close, strict=True) if is_near]
     return near if 2 * len(near) > len(logs) else []
@@ -153,7 +156,9 @@ def _later(plants: PlantSetSpec, delay_s: float, unsure_s: float) -> PlantSetSpe
 
 def _alike(apart_s: Array) -> float | None:
     """Return the mean of the bands whose values lie closest together; None if they differ."""
-    rising = np.sort(apart_s)
+    rising = np.sort(apart_s[np.isfinite(apart_s)])
+    if len(rising) < _ALIKE:
+        return None
     widths = rising[_ALIKE - 1 :] - rising[: len(rising) - _ALIKE + 1]
     first = int(np.argmin(widths))
     if not widths[first] <= _ALIKE_S:

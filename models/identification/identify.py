@@ -44,6 +44,7 @@ from stillpath.models.identification.messages import (
     phase_warning,
     poorly_explained,
     scale_warnings,
+    unvaried_notes,
 )
 from stillpath.models.identification.modal_fit import refit
 from stillpath.models.identification.nozzle import Frame, frame_of
@@ -265,7 +266,7 @@ class _AxisWork:
         if plants.provenance is not None:
             about = plants.provenance.model_copy(update={"sources": self._origin.sources})
             plants = plants.model_copy(update={"provenance": about})
-        return AxisIdentification(axis=self._axis, plants=plants)
+        return AxisIdentification(axis=self._axis, plants=plants, notes=unvaried_notes(plants))
 
     def _from_responses(self) -> AxisIdentification:
         responses = [(self._response(m), m.condition) for m in self._used]

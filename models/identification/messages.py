@@ -13,7 +13,7 @@ from stillpath.models.identification.estimation import plateau_gain
 from stillpath.models.identification.nozzle import Frame
 from stillpath.models.identification.readers.checks import RANGE_ENDED
 from stillpath.models.identification.types import Excitation, Fit, FrequencyResponse, Spectrum
-from stillpath.models.plants import RelativeModesSpec
+from stillpath.models.plants import PlantSetSpec, RelativeModesSpec
 
 __all__ = [
     "apart_warning",
@@ -28,6 +28,7 @@ __all__ = [
     "parted",
     "scale_warnings",
     "spectrum_level_warning",
+    "unvaried_notes",
 ]
 
 _MOSTLY = 0.8
@@ -107,6 +108,17 @@ def no_frame_note(frames_hz: Mapping[Literal["x", "y"], float | None]) -> str:
         f"what shakes weakly at {seen} lies too far apart to be one frame on its feet, so most "
         "plants keep it (frame_firm: all of them; raw logs would tell)"
     )
+
+
+def unvaried_notes(plants: PlantSetSpec) -> tuple[str, ...]:
+    """Say of a model from a file that it has no members."""
+    if plants.members:
+        return ()
+    note = (
+        "the model's frequencies cannot be varied, so commands are designed for it alone, as if it "
+        "were exact; give its modes, or zeros and poles"
+    )
+    return (note,)
 
 
 def parted(told: Iterable[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:

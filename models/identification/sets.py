@@ -6,11 +6,13 @@ measurements.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import date
 
 import numpy as np
+from pydantic import ValidationError
 
 from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
@@ -81,6 +83,8 @@ _NO_DIFFERENCE = 0.02
 _BAD_MEMBER = 3.0
 _FEW_REPEATS = 1.25
 """Factor on the scatter of two or three repeats, which show less than there is."""
+_NO_MIDDLE = 1.05
+"""Ratio of resonances under different labels from which their mean is the response of no plant."""
 _POINTS = 200
 _DELAYS_DIFFER_S = 0.2e-3
 _MOST_GROUNDED = 0.5
@@ -217,11 +221,18 @@ def plant_set_from(
 
 
 def model_file_set(spec: PlantSpec) -> PlantSetSpec:
-    """Return the set of a plant that was not measured here but read from a file."""
+    """Return the set of a plant that was not measured here but read from a file.
+
+    It is varied as far as it can be: taps have no frequencies, and pairs that hardly ring no more
+    damping.
+    """
     kind: Kind = "model file"
-    return PlantSetSpec(
-        nominal=spec, members=parametric_members(kind), provenance=Provenance(kind=kind)
-    )
+    alone = PlantSetSpec(nominal=spec, provenance=Provenance(kind=kind))
+    every = parametric_members(kind)
+    for members in (every, ParametricMembers(frequency_scale=every.frequency_scale)):
+        with contextlib.suppress(ValidationError):
+            return PlantSetSpec.model_validate({**dict(alone), "members": members})
+    return alone
 
 
 def parametric_members(kind: Kind) -> ParametricMembers:
@@ -371,13 +382,21 @@ def _outside_scatter(fits: list[Fit], nominal: Fit, scatter: Array) -> list[Fit]
 
 
 def _set_notes(names: list[str], fits: list[Fit], kept: list[Fit], nominal: Fit) -> tuple[str, ...]:
+    pairs = list(zip(names, fits, strict=False))
     notes = [
         f"{name or 'a measurement'}: the pairs of the mean leave {100 * fit.residual:.2g} % "
         f"of it (of the mean {100 * nominal.residual:.2g} %); fit it by itself, another "
         "mode may have moved into the band"
-        for name, fit in zip(names, fits, strict=False)
+        for name, fit in pairs
         if fit.residual > _BAD_MEMBER * nominal.residual
     ]
+    main = sorted((max(fit.modes, key=lambda m: m.peak).f_hz, name) for name, fit in pairs)
+    if main and main[-1][0] > _NO_MIDDLE * main[0][0]:
+        notes.append(
+            f"what rings most is at {main[0][0]:.1f} Hz in {main[0][1] or 'a measurement'} and at "
+            f"{main[-1][0]:.1f} Hz in {main[-1][1] or 'another'}, too far apart for a plant in the "
+            "middle; say where each was measured (FILE@z=150), or leave all but one label out"
+        )
     if len(kept) < len(fits):
         notes.append(
             f"{len(fits) - len(kept)} of {len(fits)} measurements add no member of their own: "

@@ -27,6 +27,8 @@ __all__ = [
 _LEAST_SHARE, _LEAST_COUNT = 0.1, 30
 _PRINTERS_HZ = 150.0
 """Printers have their modes below this frequency: a model need not follow above it."""
+_MAIN_HZ = (1.0, 500.0)
+"""As for a resonance that is typed in."""
 _MOST_UNSURE = 0.05
 """Relative standard deviation of the frequency of the mode that rings most."""
 _MOST_LEVEL = 2.0
@@ -56,12 +58,13 @@ def check_informative(
     ------
     ModelError
         If hardly any frequency is coherent, or the mode that rings most lies outside of what was
-        measured or might be anywhere.
+        measured, is no printer's, or might be anywhere.
     """
     names = ", ".join(sources)
     for one in measured:
         _check_coherent(one, names)
     low, high = fit.band_hz
+    told = "".join(f"And: {warning}. " for warning in warnings)
     # In a spectrum, modes beyond the band only shape its flank.
     seen = [m for m in fit.modes if low <= m.f_hz <= high] if fit.magnitude_only else []
     main = max(seen or fit.modes, key=lambda m: m.peak, default=None)
@@ -71,15 +74,20 @@ def check_informative(
         raise ModelError(
             f"{names}: the mode that rings most would be at {main.f_hz:.1f} Hz, outside the "
             f"measured {low:.1f} to {high:.1f} Hz, so it was not measured. "
-            + "".join(f"And: {warning}. " for warning in warnings)
-            + _MEASURE
+            f"{told}{_MEASURE}"
+        )
+    if not _MAIN_HZ[0] <= main.f_hz <= _MAIN_HZ[1]:
+        raise ModelError(
+            f"{names}: the mode that rings most would be at {main.f_hz:.3g} Hz; that of a printer "
+            f"lies between {_MAIN_HZ[0]:g} and {_MAIN_HZ[1]:g} Hz: frequencies must be in Hz (not "
+            "kHz or rad/s), and times in seconds"
         )
     # Modes of a spectrum trade places with each other; its set knows how far it can be trusted.
     if not fit.magnitude_only and not main_mode_known(fit):
         raise ModelError(
             f"{names}: the mode that rings most is at {main.f_hz:.1f} Hz, give or take "
             f"{2 * main.f_sd_hz:.1f} Hz; it must be known within {2 * _MOST_UNSURE:.0%} to be "
-            f"compensated. {_MEASURE}"
+            f"compensated. {told}{_MEASURE}"
         )
 
 

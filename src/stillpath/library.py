@@ -107,18 +107,21 @@ def plan(
     Raises
     ------
     stillpath.gcode.errors.GcodeError, stillpath.models.errors.ModelError
+        Also where `target` is the file that is read.
     """
     from stillpath.pipeline.simulate import plan_file
 
     return plan_file(Path(source), Path(target), _machine(machine), rate_hz=rate_hz)
 
 
-def identify(files: Iterable[str | Path], base: Machine | str, *, name: str) -> Machine:
+def identify(
+    files: Iterable[str | Path] | str | Path, base: Machine | str, *, name: str
+) -> Machine:
     """Build a machine model from measurements: raw logs, resonance tables, and others.
 
     Parameters
     ----------
-    files : iterable of path
+    files : path, or iterable of them
         Which axis a file belongs to is read from its name or its content.
     base : Machine or str
         The machine that all but the plants comes from.
@@ -132,7 +135,8 @@ def identify(files: Iterable[str | Path], base: Machine | str, *, name: str) -> 
     """
     from stillpath.applications.identification.run import identify_files, read_inputs
 
-    found = identify_files(read_inputs([str(file) for file in files]), _machine(base), name=name)
+    listed = [files] if isinstance(files, str | Path) else files
+    found = identify_files(read_inputs([str(file) for file in listed]), _machine(base), name=name)
     return found.machine
 
 

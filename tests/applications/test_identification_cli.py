@@ -222,6 +222,37 @@ def test_what_a_model_does_not_say(store: MachineStore, folder: Path, capsys) ->
     assert identify(file, "--sampling-s", "0.001", "--dc-gain", "1.3", quick=False) == 0
 
 
+@pytest.mark.parametrize(
+    ("model", "members", "said"),
+    [
+        ({"kind": "fir", "taps": [0.25, 0.5, 0.25], "dt_s": 0.001}, 1, "designed for it alone"),
+        # More damping would make its poles real.
+        ({"num": [1e5], "den": [1.0, 1.8 * 1e5**0.5, 1e5]}, 3, ""),
+        # No continuous plant has this pole, but commands have the model's own samples.
+        ({"num": [1.5], "den": [1.0, 0.5], "dt": 0.001}, 9, ""),
+    ],
+)
+def test_a_model_is_varied_as_far_as_it_can_be(
+    store: MachineStore, folder: Path, capsys, model: dict[str, object], members: int, said: str
+) -> None:
+    (folder / "m_x.json").write_text(json.dumps(model))
+    assert identify(folder / "m_x.json", "-m", "mine", quick=False) == 0
+    assert said in " ".join(capsys.readouterr().out.split())
+    assert len(store.current("mine").machine.axes["x"].weighted_members()) == members
+
+
+def test_a_model_of_other_samples_than_commands_have(
+    store: MachineStore, folder: Path, capsys
+) -> None:
+    model = {"kind": "fir", "taps": [0.5, 0.5], "dt_s": 0.002}
+    (folder / "m_x.json").write_text(json.dumps(model))
+    assert identify(folder / "m_x.json", "-m", "mine", quick=False) == 2
+    assert "axis X: commands have a sample every 1 ms, and the discrete plant (2 ms)" in (
+        one_line(capsys)
+    )
+    assert store.current("mine").number == 1
+
+
 # What cannot be used
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gzip
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -38,6 +40,16 @@ def test_a_file_as_output(folder: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert first.amplitude_um == pytest.approx(20.0, rel=0.01)
 
 
+@pytest.mark.parametrize(
+    "written", [lambda text: gzip.compress(text.encode()), lambda text: text.encode("utf-16")]
+)
+def test_a_pass_is_stored_as_any_measurement_may_be(
+    written: Callable[[str], bytes], folder: Path
+) -> None:
+    (folder / "pass.csv").write_bytes(written(log()))
+    assert learn(folder, "--base", str(folder / "base.json")) == 0
+
+
 def test_revisions_of_a_machine(folder: Path) -> None:
     assert learn(folder, "--base", str(folder / "base.json"), "-m", "mine") == 0
     (folder / "pass.csv").write_text(log(share=0.5))
@@ -57,6 +69,15 @@ def test_refusals_leave_nothing(folder: Path, capsys: pytest.CaptureFixture[str]
     assert not out.exists()
     assert run(["identify", str(folder / "pass.csv"), "--ripple", "belt:2"]) == 2
     assert "--axis" in capsys.readouterr().err
+
+
+def test_a_file_of_more_rows_than_a_pass_has(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = "0,1,2\n" * 1_002_000
+    (folder / "pass.csv").write_text(f"# homed\ntime_s,position_mm,measured_mm\n{rows}")
+    assert learn(folder, "--base", str(folder / "base.json")) == 2
+    assert "at most 1000000 samples are read" in capsys.readouterr().err
 
 
 def test_a_title_that_no_machine_has(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

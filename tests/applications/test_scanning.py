@@ -18,7 +18,7 @@ from stillpath.applications.scanning.scan import ScanSettings, scan_file
 from stillpath.cli.main import run
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.feedback.preview_command import preview_command
-from stillpath.models.disturbances import Narrowband, Tone
+from stillpath.models.disturbances import Narrowband, SensorSpec, Tone
 from stillpath.models.loops import builtin_loops, load_loop
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "hatch.gcode"
@@ -89,6 +89,18 @@ def test_command_drives_the_loop_along_the_path() -> None:
     assert np.ptp(drawn_mm[0]) == pytest.approx(2.198, abs=0.11)
     # F60000: 1 m/s, .1 mm a sample.
     np.testing.assert_allclose(np.diff(drawn_mm[0]), 0.1, atol=1e-9)
+
+
+def test_the_sensors_resolution_is_in_the_machines_unit() -> None:
+    table = load_loop("direct-drive-table")
+    assert table.unit == "mm"
+    in_um = table.model_copy(update={"unit": "um", "sensor": SensorSpec(quantum=50.0)})
+    in_mm = table.model_copy(update={"sensor": SensorSpec(quantum=0.05)})
+    coarse, same, fine = (
+        by_name(scan_file(EXAMPLE, spec, ScanSettings()).report) for spec in (in_um, in_mm, table)
+    )
+    assert same == pytest.approx(coarse, rel=1e-9)
+    assert same["prefilter"] > 1.01 * fine["prefilter"]
 
 
 def test_tracks_are_the_lines_of_the_file() -> None:

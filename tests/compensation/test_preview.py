@@ -21,7 +21,7 @@ from stillpath.compensation.basis import BASES, bspline_basis, ce_opt_basis
 from stillpath.compensation.lifted import LiftedSet
 from stillpath.compensation.lifted_window import LiftedWindow, lifted_window
 from stillpath.compensation.preview import PreviewDesign
-from stillpath.models.plants import DiscretePlant, plant_set
+from stillpath.models.plants import DiscretePlant, FirSpec, discretise, plant_set
 from stillpath.models.reference_motion import reference_motion
 from stillpath.models.store import load_machine
 from stillpath.simulation.measures import contour_error
@@ -243,6 +243,9 @@ def test_wrong_sets() -> None:
         lifted_window([good, unstable], [0.5, 0.5], 60, 30)
     with pytest.raises(DesignError, match="between 2 and the window's 60"):
         lifted_window([good], [1.0], 60, 61)
+    late = discretise(FirSpec(taps=(0.0,) * 60 + (1.0,), dt_s=DT_S), DT_S)
+    with pytest.raises(DesignError, match="no plant answers within the preview of 60 samples"):
+        lifted_window([late], [1.0], 60, 30)
 
 
 @settings(max_examples=20)

@@ -67,6 +67,12 @@ def test_wideband_has_its_humps_and_power() -> None:
     assert np.array_equal(d, again)
     with pytest.raises(ModelError, match="generator"):
         sample(spec, 10, TS)
+    # Between two frequencies of this time.
+    narrow = Wideband(peaks=(Peak(f_hz=900.5, width_hz=1e-6, rms=2.0),))
+    assert np.std(sample(narrow, 10_000, TS, np.random.default_rng(0))) > 0.5
+    beyond = Wideband(peaks=(Peak(f_hz=6000, width_hz=100, rms=1.0),))
+    with pytest.raises(ModelError, match="hump of 6000 Hz: not below half the sampling rate"):
+        sample(beyond, 10_000, TS, np.random.default_rng(0))
 
 
 def test_documents_tell_their_kind() -> None:

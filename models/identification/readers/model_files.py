@@ -217,6 +217,8 @@ def _polynomial(given: Any, name: str) -> list[float]:
     if isinstance(inner, list) and inner and all(isinstance(c, _Printed) for c in inner):
         return _few(inner, name)
     values = _numbers(inner, name)
+    if values.size == 0:
+        raise ModelError(f"{name} has no coefficients")
     if np.any(values.imag):
         raise ModelError(f"{name} has complex coefficients; they must be real")
     if values.ndim > 1 and sum(size > 1 for size in values.shape) > 1:

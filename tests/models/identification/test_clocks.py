@@ -94,6 +94,9 @@ ON_TIME = in_bands(0.3, 0.3, 0.3, 0.3)
         ([ON_TIME], [in_bands(0.5, 1.4, 0.52, 0.54)], {"y": 0.22}),
         ([ON_TIME], [in_bands(0.25, 1.1, 0.67, 0.62)], {}),
         ([ON_TIME], [in_bands(0.5, np.nan, 0.5, np.nan)], {}),
+        # The test of a stiff axis ends below the last band.
+        ([ON_TIME], [in_bands(0.5, 0.5, 0.5, np.nan)], {"y": 0.2}),
+        ([in_bands(0.3, 0.3, 0.3, np.nan)], [in_bands(np.nan, 0.5, 0.5, 0.5)], {}),
         # Less than the clocks tell, and more than guides do.
         ([ON_TIME], [in_bands(0.32, 0.33, 0.34, 0.33)], {}),
         ([ON_TIME], [in_bands(2.5, 2.5, 2.5, 2.5)], {}),

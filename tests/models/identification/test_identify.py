@@ -21,12 +21,15 @@ from stillpath.models.identification.modal_fit import fit_modes
 from stillpath.models.identification.prompt import prompt
 from stillpath.models.identification.readers import ReadSettings, read_content
 from stillpath.models.identification.synthetic import Sensor
+from stillpath.models.identification.trust import check_informative
 from stillpath.models.identification.types import (
     AccelerationLog,
     AxisIdentification,
     Excitation,
+    Fit,
     FrequencyResponse,
     Measurement,
+    ModeEstimate,
     PlantModel,
     Spectrum,
 )
@@ -203,6 +206,13 @@ def test_a_response_that_may_not_be_1_at_low_frequency(gain: float) -> None:
         rtol=1e-2,
         atol=1e-2,  # a real zero stands for time that nobody has
     )
+
+
+@pytest.mark.parametrize("unit", [1e-3, 60.0])
+def test_frequencies_that_are_not_in_hz(unit: float) -> None:
+    plain = response(one_mode(40.0, 0.05))
+    with pytest.raises(ModelError, match=r"frequencies must be in Hz \(not kHz"):
+        identify([at(replace(plain, f_hz=unit * plain.f_hz))])
 
 
 @pytest.mark.slow
@@ -456,6 +466,19 @@ def test_labels_are_members_and_repeats_are_one() -> None:
     assert len(found.measured) == 5
     assert len(found.member_fits) == 2
     assert len(found.plants.weighted_members()) == 3
+
+
+def test_labels_too_far_apart_for_a_mean_are_named() -> None:
+    near, far = (at(response(one_mode(f, 0.05)), f"{f:g}") for f in (52.0, 58.0))
+    said = "what rings most is at 52.0 Hz in 52 and at 58.0 Hz in 58"
+    assert any(said in warning for warning in identify([near, far])["x"].warnings)
+
+
+def test_a_mode_that_might_be_anywhere_is_refused_with_what_else_was_found() -> None:
+    unsure = ModeEstimate(f_hz=54.0, zeta=0.05, f_sd_hz=8.0, zeta_sd=0.01, peak=10.0)
+    fit = Fit(one_mode(54.0, 0.05), 0.1, 1.0, 0.0, (5.0, 130.0), (unsure,))
+    with pytest.raises(ModelError, match=r"give or take 16\.0 Hz; .* And: two labels\. Measure"):
+        check_informative(fit, (), ["a.csv"], ["two labels"])
 
 
 def test_repeats_alone_make_a_set_of_what_explains_them() -> None:

@@ -173,6 +173,7 @@ def test_dc_gain_far_off_needs_a_word() -> None:
         ({"num": [1], "den": [1, 1], "dt": True}, "does not say its sampling time"),
         ({"num": [1], "den": ["a", 1]}, "den is .* not made of numbers"),
         ({"num": [[1], [2]], "den": [1, 1]}, "not made of numbers"),
+        ({"num": [], "den": []}, "num has no coefficients"),
         ({"num": ["1+2j"], "den": [1, 1]}, "complex coefficients"),
         ({"A": [[1, 2]], "B": [1], "C": [1], "D": 0}, "do not fit together"),
         ({"A": "no", "B": [1], "C": [1]}, "A is not a matrix"),
