@@ -68,6 +68,8 @@ _MIGRATION_LOCK = 0x57111_0000
 _READ_ONLY = "25006"
 """PostgreSQL's code of a server that takes no writes: a standby, or one whose disk is full."""
 _ON_POSTGRESQL: dict[str, Any] = {
+    # A pooler such as PgBouncer may run the next statement on another connection to the server.
+    "prepare_threshold": None,
     # A server that vanished is noticed before a worker counts as lost.
     "connect_timeout": 5,
     "keepalives_idle": 5,

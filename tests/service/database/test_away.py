@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from sqlalchemy import text
 
 from stillpath.service.database import engine as database
 from stillpath.service.database.engine import DatabaseAway, open_database
@@ -57,6 +58,19 @@ def test_postgresql_that_takes_no_writes(postgres_url: str, tmp_path: Path):
     with pytest.raises(DatabaseAway, match="read-only transaction"):
         store.add(make_job())
     assert store.counts()[JobState.QUEUED] == 0
+    engine.dispose()
+
+
+@pytest.mark.postgresql
+def test_postgresql_behind_a_pooler(postgres_url: str, tmp_path: Path):
+    """PgBouncer may run each transaction elsewhere: nothing may stay on a connection."""
+    engine = open_database(Settings(data_dir=tmp_path, database_url=postgres_url))
+    store = JobStore(engine)
+    for _ in range(20):
+        store.counts()
+    with database.reading(engine) as connection:
+        for kept in ("pg_prepared_statements", "pg_cursors", "pg_listening_channels()"):
+            assert connection.scalar(text(f"SELECT count(*) FROM {kept}")) == 0
     engine.dispose()
 
 
