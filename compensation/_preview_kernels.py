@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from stillpath.models.jit import kernel
 
-__all__ = ["advance_state", "advance_window", "impulse_states", "run_windows"]
+__all__ = ["advance_state", "advance_window", "block_starts", "impulse_states", "run_windows"]
 
 _NOTHING = 1e-100
 
@@ -100,3 +100,21 @@ def advance_state(
             following[i] = total if abs(total) > _NOTHING else 0.0
         x[:] = following
     return x
+
+
+@kernel
+def block_starts(
+    step: NDArray[np.float64], drive: NDArray[np.float64], state: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return x <- step x + drive[k] from `state` on, shape (blocks + 1, order), both ends too."""
+    blocks, order = drive.shape
+    out = np.empty((blocks + 1, order))
+    out[0] = state
+    for k in range(blocks):
+        for i in range(order):
+            total = drive[k, i]
+            for j in range(order):
+                total += step[i, j] * out[k, j]
+            # Flush decayed states to zero: denormal numbers are a hundred times slower.
+            out[k + 1, i] = total if abs(total) > _NOTHING else 0.0
+    return out

@@ -8,18 +8,37 @@ from numpy.typing import NDArray
 from stillpath.models.arrays import Array
 from stillpath.models.jit import kernel
 
-__all__ = ["contour_square", "move_targets", "nearest_point"]
+__all__ = ["contour_square", "longest_step", "move_targets", "nearest_point"]
 
 
 @kernel
-def nearest_point(path: Array, x: float, y: float, k: int, reach: int) -> tuple[float, float]:
-    """Return the nearest point of the path (2, n) within `reach` samples of sample k."""
+def longest_step(path: Array) -> float:
+    """Return the largest distance between neighbouring samples of a path (2, n)."""
+    longest = 0.0
+    for k in range(path.shape[1] - 1):
+        dx, dy = path[0, k + 1] - path[0, k], path[1, k + 1] - path[1, k]
+        longest = max(longest, dx * dx + dy * dy)
+    return float(np.sqrt(longest))
+
+
+@kernel
+def nearest_point(
+    path: Array, x: float, y: float, k: int, reach: int, longest: float
+) -> tuple[float, float]:
+    """Return the nearest point of the path (2, n) within `reach` samples of sample k.
+
+    No step of the path is longer than `longest`.
+    """
     n = path.shape[1]
     bx, by = path[0, k], path[1, k]
     nearest = (x - bx) ** 2 + (y - by) ** 2
+    # A step that begins farther away cannot come nearer.
+    limit = (np.sqrt(nearest) + longest) ** 2
     for i in range(max(0, k - reach), min(n - 1, k + reach)):
-        dx, dy = path[0, i + 1] - path[0, i], path[1, i + 1] - path[1, i]
         ex, ey = x - path[0, i], y - path[1, i]
+        if ex * ex + ey * ey > limit:
+            continue
+        dx, dy = path[0, i + 1] - path[0, i], path[1, i + 1] - path[1, i]
         size = dx * dx + dy * dy
         if size > 0.0:
             share = min(1.0, max(0.0, (ex * dx + ey * dy) / size))
@@ -28,6 +47,7 @@ def nearest_point(path: Array, x: float, y: float, k: int, reach: int) -> tuple[
         squared = ex * ex + ey * ey
         if squared < nearest:
             nearest = squared
+            limit = (np.sqrt(nearest) + longest) ** 2
             bx, by = x - ex, y - ey
     return bx, by
 
@@ -60,10 +80,11 @@ def move_targets(
         1: exactly to the new targets; up to 1.9: beyond them (over-relaxation).
     targets : ndarray, shape (2, n)
     """
+    longest = longest_step(path)
     for k in range(path.shape[1]):
         px, py = path[0, k], path[1, k]
         if extruding[k]:
-            bx, by = nearest_point(path, answer[0, k], answer[1, k], k, reach)
+            bx, by = nearest_point(path, answer[0, k], answer[1, k], k, reach, longest)
             tx, ty = bx + tau * (px - bx), by + tau * (py - by)
         else:
             tx = answer[0, k] + travel * (px - answer[0, k])
@@ -78,9 +99,10 @@ def contour_square(
 ) -> float:
     """Return the mean squared distance from the path while extruding, every `stride` samples."""
     total, count = 0.0, 0
+    longest = longest_step(path)
     for k in range(0, path.shape[1], stride):
         if extruding[k]:
-            bx, by = nearest_point(path, answer[0, k], answer[1, k], k, reach)
+            bx, by = nearest_point(path, answer[0, k], answer[1, k], k, reach, longest)
             total += (answer[0, k] - bx) ** 2 + (answer[1, k] - by) ** 2
             count += 1
     return total / max(count, 1)

@@ -12,6 +12,7 @@ from stillpath.compensation._preview_kernels import advance_state, advance_windo
 from stillpath.compensation._window_kernels import Functions, Memory, Stepping, solve_windows
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.basis import BASES, ce_opt_basis, robust_basis
+from stillpath.compensation.block_response import BlockResponse
 from stillpath.compensation.lifted_window import LiftedWindow, condensed, lifted_window
 from stillpath.compensation.preview import PreviewDesign
 from stillpath.compensation.window_problem import (
@@ -23,7 +24,6 @@ from stillpath.compensation.window_problem import (
 )
 from stillpath.models.arrays import Array, Ints
 from stillpath.models.plants import DiscretePlant
-from stillpath.models.response_kernels import dense_response
 
 __all__ = [
     "BAND_MARGIN",
@@ -307,11 +307,14 @@ class PreviewAxis:
     def answer(self, member: int, command: Array) -> Array:
         """Return the response (n,) of a member of the set to a command (n,)."""
         first = sum(p.order for p in self._plants[:member])
-        p = self._plants[member]
+        respond = self._responses[member]
         self._move_origin(float(command[0]))
-        state, y = self._states[first : first + p.order].copy(), np.empty_like(command)
-        dense_response(p.a, p.b, p.c, p.d, self._origin, state, command, y)
-        return y
+        state = self._states[first : first + self._plants[member].order]
+        return respond(self._origin, state, command)
+
+    @cached_property
+    def _responses(self) -> list[BlockResponse]:
+        return [BlockResponse(plant) for plant in self._plants]
 
     def windows_outside(self, bounds: Bounds, command: Array) -> set[int]:
         """Return the windows in which a command (n,) exceeds the bounds, and those before them."""

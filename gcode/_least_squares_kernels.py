@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from stillpath.models.jit import kernel
 
-__all__ = ["Weight", "normal_equations", "reach"]
+__all__ = ["Weight", "line_errors", "normal_equations", "reach"]
 
 
 class Weight(NamedTuple):
@@ -17,8 +17,8 @@ class Weight(NamedTuple):
 
     Attributes
     ----------
-    correlation : ndarray, shape (lags,)
-        g at lags 0, 1, ..; it is even, and 0 beyond.
+    correlation : ndarray, shape (2 lags - 1,)
+        g at lags .., -1, 0, 1, ..; it is even, and 0 beyond.
     moments : ndarray, shape (lags + 2,)
         An even sequence whose fourth difference is g. Beyond the table it is a cubic.
     bends : ndarray, shape (2,)
@@ -44,11 +44,33 @@ def reach(knot: NDArray[np.int64], lags: int) -> int:
 
 
 @kernel(allocates=False)
+def line_errors(
+    command: NDArray[np.float64], knot: NDArray[np.int64], error: NDArray[np.float64]
+) -> None:
+    """Fill `error` with the distance of a command from straight lines between its own samples.
+
+    Parameters
+    ----------
+    command : ndarray, shape (n,)
+        One axis of the command.
+    knot : ndarray of int64, shape (m,)
+        Samples at which segments end, rising, with the beginning of the first.
+    error : ndarray, shape (knot[m - 1] - knot[0] + 1,)
+        From the first of these samples to the last.
+    """
+    first = knot[0]
+    for i in range(1, len(knot)):
+        a, b = knot[i - 1], knot[i]
+        slope = (command[b] - command[a]) / (b - a)
+        for k in range(a, b):
+            error[k - first] = command[k] - command[a] - slope * (k - a)
+    error[len(error) - 1] = 0.0
+
+
+@kernel(allocates=False)
 def normal_equations(
-    command: NDArray[np.float64],
     knot: NDArray[np.int64],
     weight: Weight,
-    error: NDArray[np.float64],
     felt: NDArray[np.float64],
     band: NDArray[np.float64],
     right: NDArray[np.float64],
@@ -57,68 +79,50 @@ def normal_equations(
 
     Parameters
     ----------
-    command : ndarray, shape (n,)
-        One axis of the command.
     knot : ndarray of int64, shape (m,)
-        Samples at which segments end, rising, with the beginning of the first.
+        As in `line_errors`.
     weight : Weight
-    error, felt : ndarray, shape (n,)
-        Scratch.
+    felt : ndarray, shape (knot[m - 1] - knot[0] + 1,)
+        The errors as they count: convolved with the correlation.
     band : ndarray, shape (u + 1, m - 2)
         The upper part of the matrix, in LAPACK's banded form.
     right : ndarray, shape (m - 2,)
     """
-    first, last = knot[0], knot[len(knot) - 1]
-    for i in range(1, len(knot)):
-        a, b = knot[i - 1], knot[i]
-        slope = (command[b] - command[a]) / (b - a)
-        for k in range(a, b):
-            error[k] = command[k] - command[a] - slope * (k - a)
-    error[last] = 0.0
-    # The error as it counts: convolved with the correlation.
-    for k in range(first, last + 1):
-        felt[k] = weight.correlation[0] * error[k]
-    for lag in range(1, len(weight.correlation)):
-        g = weight.correlation[lag]
-        for k in range(first, last + 1 - lag):
-            felt[k] += g * error[k + lag]
-        for k in range(first + lag, last + 1):
-            felt[k] += g * error[k - lag]
-    above = band.shape[0] - 1
-    for i in range(1, len(knot) - 1):
-        a, b, c = knot[i - 1], knot[i], knot[i + 1]
-        total = felt[b]
-        for k in range(a + 1, b):
-            total += felt[k] * (k - a) / (b - a)
-        for k in range(b + 1, c):
-            total += felt[k] * (c - k) / (c - b)
-        right[i - 1] = total
-        for j in range(max(1, i - above), i + 1):
-            band[above + j - i, i - 1] = _product(knot, i, j, weight)
+    above, inner = band.shape[0] - 1, len(knot) - 2
+    for i in range(1, inner + 1):
+        right[i - 1] = _under_hat(
+            knot[i - 1] - knot[0], knot[i] - knot[0], knot[i + 1] - knot[0], felt
+        )
+        # The cost of two hats is a sum over the bends of both. From here on of this one's, at the
+        # three knots of the other.
+        before, here = _moments(knot, i, i - 1, weight), _moments(knot, i, i, weight)
+        for j in range(i, min(i + above, inner) + 1):
+            after = _moments(knot, i, j + 1, weight)
+            rises, falls = 1.0 / (knot[j] - knot[j - 1]), 1.0 / (knot[j + 1] - knot[j])
+            band[above + i - j, j - 1] = rises * before - (rises + falls) * here + falls * after
+            before, here = here, after
         # Rounding must not make the matrix indefinite.
         band[above, i - 1] *= 1.0 + 1e-9
 
 
 @kernel(force_inline=True, allocates=False)
-def _product(knot: NDArray[np.int64], i: int, j: int, weight: Weight) -> float:
-    """Cost of two hats, one around each end: a sum over their bends of the moments."""
-    total = 0.0
-    for p in range(-1, 2):
-        for q in range(-1, 2):
-            lag = abs(knot[i + p] - knot[j + q])
-            total += _bend(knot, i, p) * _bend(knot, j, q) * _moment(lag, weight)
-    return total
+def _under_hat(a: int, b: int, c: int, felt: NDArray[np.float64]) -> float:
+    """Return the sum of errors times a hat that is 1 at sample b, 0 at a and c."""
+    total = felt[b]
+    for k in range(a + 1, b):
+        total += felt[k] * (k - a) / (b - a)
+    for k in range(b + 1, c):
+        total += felt[k] * (c - k) / (c - b)
+    return float(total)
 
 
 @kernel(force_inline=True, allocates=False)
-def _bend(knot: NDArray[np.int64], i: int, p: int) -> float:
-    """Second difference, at knot i + p, of the hat that is 1 at knot i and 0 at its neighbours."""
+def _moments(knot: NDArray[np.int64], i: int, at: int, weight: Weight) -> float:
+    """Return the moments of the bends of the hat around knot i, seen from knot `at`."""
     rises, falls = 1.0 / (knot[i] - knot[i - 1]), 1.0 / (knot[i + 1] - knot[i])
-    if p < 0:
-        return float(rises)
-    if p > 0:
-        return float(falls)
-    return float(-(rises + falls))
+    total = rises * _moment(abs(knot[at] - knot[i - 1]), weight)
+    total -= (rises + falls) * _moment(abs(knot[at] - knot[i]), weight)
+    return float(total + falls * _moment(abs(knot[at] - knot[i + 1]), weight))
 
 
 @kernel(force_inline=True, allocates=False)

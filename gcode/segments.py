@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 
-from stillpath.gcode._least_squares_kernels import Weight, normal_equations, reach
+from stillpath.gcode._least_squares_kernels import Weight, line_errors, normal_equations, reach
 from stillpath.gcode._segment_kernels import Bounds, choose_ends, path_directions
 from stillpath.gcode.timeline import Timeline
 from stillpath.models.modal import modal_form
@@ -199,7 +199,6 @@ class _Fit:
         self._end_mm = np.empty((4, capacity))
         self._direction = np.empty((2, samples))
         path_directions(timeline.position_mm[:2], self._direction)
-        self._scratch = np.empty((2, samples))
         self._count = 0
 
     def stretch(self, i: int, start_s: float, first: int, last: int, crawl_mm: float) -> None:
@@ -242,11 +241,13 @@ class _Fit:
             return
         place = self._command_mm[:2, knot]
         shift = np.empty((2, len(inner)))
-        above = reach(knot, _LAGS)
+        above, error = reach(knot, _LAGS), np.empty(knot[-1] - knot[0] + 1)
         for axis, cost in enumerate(self._filter.costs):
             band = np.zeros((above + 1, len(inner)))
-            command, (error, felt) = self._command_mm[axis], self._scratch
-            normal_equations(command, knot, cost, error, felt, band, shift[axis])
+            line_errors(self._command_mm[axis], knot, error)
+            # As they count, with those before and after.
+            felt = np.convolve(error, cost.correlation)[_LAGS - 1 : 1 - _LAGS]
+            normal_equations(knot, cost, felt, band, shift[axis])
             shift[axis] = solveh_banded(band, shift[axis], overwrite_ab=True, check_finite=False)
         end_mm[:2, :-1] = self._grid_mm * np.round((place[:, 1:-1] + shift) / self._grid_mm)
         end_mm[3, :-1] += _filament(place, np.append(begin[3], end_mm[3]), shift)
@@ -341,4 +342,5 @@ def weighing(correlation: NDArray[np.float64]) -> Weight:
     for k in range(1, lags + 2):
         bend[k + 1] = 2.0 * bend[k] - bend[k - 1] + (correlation[k] if k < lags else 0.0)
         moment[k + 1] = 2.0 * moment[k] - moment[k - 1] + bend[k]
-    return Weight(correlation, moment[: lags + 2], bend[lags : lags + 2].copy())
+    both_sides = np.append(correlation[:0:-1], correlation)
+    return Weight(both_sides, moment[: lags + 2], bend[lags : lags + 2].copy())
