@@ -133,7 +133,8 @@ def solve_windows(
     rest_functions: Functions,
     squeeze: Array,
     path: Array,
-    targets: Array,
+    share: Array,
+    slid: Array,
     weight: Array,
     stops: Ints,
     careful: Flags,
@@ -155,7 +156,10 @@ def solve_windows(
         Maps the plants' states to those of `rest_functions`, which may also have fewer components.
     path, weight : ndarray, shape (windows update + window,)
         As in `tied_window`, for the whole piece.
-    targets : ndarray, shape (components, windows update + window)
+    share : ndarray, shape (components,)
+        Each component's target is this share of the path.
+    slid : ndarray, shape (components, n) or (components, 0)
+        What is added to the targets of the first n samples.
     stops : ndarray of int64, shape (k, 2)
         Ranges [a, b) of samples, rising and disjoint.
     careful : ndarray of bool, shape (windows,)
@@ -188,7 +192,7 @@ def solve_windows(
             continue
         _step(stepping, z, waiting, w, u)
         if not (memory.known[w] and _same(memory.z[w], z)):
-            used, states, components = functions, z, len(targets)
+            used, states, components = functions, z, len(share)
             if coming > met:
                 used, components = rest_functions, len(rest_functions.filtered)
                 states = np.concatenate((np.dot(squeeze, z[:-2]), z[-2:]))
@@ -196,7 +200,7 @@ def solve_windows(
                 used,
                 states,
                 path[start : start + window],
-                targets[:components, start : start + window],
+                _targets(share[:components], path, slid, start, window),
                 weight[start : start + window],
                 stops[met:coming] - start,
                 limits,
@@ -211,6 +215,18 @@ def solve_windows(
     _step(stepping, z, waiting, last, u)
     row, table = np.empty(0), np.empty((0, 0))
     return last, Tied(row, True, np.empty((0, 2), np.int64), row, table, row, table, table, row)
+
+
+@kernel
+def _targets(share: Array, path: Array, slid: Array, start: int, window: int) -> Array:
+    """Return the targets of a window, shape (components, window), as in `solve_windows`."""
+    out = np.empty((len(share), window))
+    for c in range(len(share)):
+        for k in range(window):
+            out[c, k] = share[c] * path[start + k]
+        for k in range(start, min(start + window, slid.shape[1])):
+            out[c, k - start] += slid[c, k]
+    return out
 
 
 @kernel

@@ -126,6 +126,16 @@ class PreviewDesign:
             )
 
     @cached_property
+    def node_gain(self) -> Array:
+        """S[nodes]."""
+        return np.asarray(self.path_gain[self.nodes])
+
+    @cached_property
+    def state_spread(self) -> Array:
+        """Effect of S[nodes] y_d on z."""
+        return np.asarray(self.state_drive @ self.spread)
+
+    @cached_property
     def efforts(self) -> Array:
         """Running Gram matrices of `basis`."""
         return running_gram(self.basis[None])

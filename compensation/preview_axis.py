@@ -124,7 +124,8 @@ class _Drive:
     ----------
     path_mm, weight : ndarray, shape (windows * update + window,)
         Those of the task, relative to the start of the path, extended beyond its end.
-    targets_mm : ndarray, shape (components, windows * update + window)
+    slid_mm : ndarray, shape (components, n), or (components, 0) where the path is the target
+        What is added to the targets of the set's components.
     command : ndarray, shape (windows, update)
         S y_d of every window.
     state : ndarray, shape (windows, nz)
@@ -137,7 +138,7 @@ class _Drive:
     rung: int
     path_mm: Array
     weight: Array
-    targets_mm: Array
+    slid_mm: Array
     command: Array
     state: Array
     memory: Memory
@@ -387,7 +388,8 @@ class PreviewAxis:
                         rest_functions,
                         self._designs.at_rests.squeeze,
                         drive.path_mm,
-                        drive.targets_mm,
+                        lifted.target,
+                        drive.slid_mm,
                         drive.weight,
                         task.stops,
                         alone,
@@ -427,22 +429,21 @@ class PreviewAxis:
         padded = np.empty(len(path) + padding)
         np.subtract(path, path[0], out=padded[: len(path)])
         padded[len(path) :] = path[-1] - path[0]
-        nodes = _products(padded, design.path_gain[design.nodes], update)
-        targets = self._designs.lifted.target[:, None] * padded
+        nodes = _products(padded, design.node_gain, update)
+        slid = np.empty((len(self._designs.lifted.target), 0))
         if targets_mm is not None:
             slid = self._designs.lifted.mix @ (targets_mm - path)
-            targets[:, : len(path)] += slid
             for component, gain in zip(slid, design.target_gain, strict=True):
                 followed = np.append(component, np.zeros(padding))
                 nodes += _products(followed, gain, update)
         command = nodes @ design.spread.T
-        state = nodes @ (design.state_drive @ design.spread).T
+        state = nodes @ design.state_spread.T
         weight = np.full(len(padded), WEIGHT_REST)
         weight[: len(path)] = task.weight
         memory = Memory(
             np.zeros(len(command), bool), np.empty(state.shape), np.empty(command.shape)
         )
-        made = _Drive(task, rung, padded, weight, targets, command, state, memory)
+        made = _Drive(task, rung, padded, weight, slid, command, state, memory)
         # Separate targets are passed in an array that changes: do not cache them.
         self._made = made if targets_mm is None else None
         return made

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from stillpath.models.jit import kernel
 
-__all__ = ["Weight", "line_errors", "normal_equations", "reach"]
+__all__ = ["Weight", "line_errors", "normal_equations", "solve", "together"]
 
 
 class Weight(NamedTuple):
@@ -31,15 +31,27 @@ class Weight(NamedTuple):
 
 
 @kernel(allocates=False)
-def reach(knot: NDArray[np.int64], lags: int) -> int:
-    """Return how many segments further on an end still counts together with this one."""
-    most = 0
-    j = 1
-    for i in range(1, len(knot) - 1):
-        j = max(j, i)
-        while j + 1 < len(knot) - 1 and knot[j] - knot[i + 1] < lags:
+def together(knot: NDArray[np.int64], lags: int, first: NDArray[np.int64]) -> int:
+    """Find the first inner end, from 0 on, with which each still counts.
+
+    Parameters
+    ----------
+    knot : ndarray of int64, shape (m,)
+        As in `line_errors`.
+    first : ndarray of int64, shape (m - 2,)
+        Filled.
+
+    Returns
+    -------
+    int
+        How many ends back that is at most.
+    """
+    most = j = 0
+    for i in range(len(first)):
+        while j < i and knot[i] - knot[j + 2] >= lags:
             j += 1
-        most = max(most, j - i)
+        first[i] = j
+        most = max(most, i - j)
     return most
 
 
@@ -70,9 +82,10 @@ def line_errors(
 @kernel(allocates=False)
 def normal_equations(
     knot: NDArray[np.int64],
+    first: NDArray[np.int64],
     weight: Weight,
     felt: NDArray[np.float64],
-    band: NDArray[np.float64],
+    rows: NDArray[np.float64],
     right: NDArray[np.float64],
 ) -> None:
     """Compute the equations for the shifts of the inner ends of a stretch's segments.
@@ -81,28 +94,64 @@ def normal_equations(
     ----------
     knot : ndarray of int64, shape (m,)
         As in `line_errors`.
+    first : ndarray of int64, shape (m - 2,)
+        From `together`.
     weight : Weight
     felt : ndarray, shape (knot[m - 1] - knot[0] + 1,)
         The errors as they count: convolved with the correlation.
-    band : ndarray, shape (u + 1, m - 2)
-        The upper part of the matrix, in LAPACK's banded form.
+    rows : ndarray, shape (m - 2, most + 1)
+        Row i receives the matrix from its column first[i] to its diagonal, which comes last.
     right : ndarray, shape (m - 2,)
     """
-    above, inner = band.shape[0] - 1, len(knot) - 2
-    for i in range(1, inner + 1):
-        right[i - 1] = _under_hat(
-            knot[i - 1] - knot[0], knot[i] - knot[0], knot[i + 1] - knot[0], felt
-        )
-        # The cost of two hats is a sum over the bends of both. From here on of this one's, at the
-        # three knots of the other.
-        before, here = _moments(knot, i, i - 1, weight), _moments(knot, i, i, weight)
-        for j in range(i, min(i + above, inner) + 1):
-            after = _moments(knot, i, j + 1, weight)
-            rises, falls = 1.0 / (knot[j] - knot[j - 1]), 1.0 / (knot[j + 1] - knot[j])
-            band[above + i - j, j - 1] = rises * before - (rises + falls) * here + falls * after
+    begin, last = knot[0], rows.shape[1] - 1
+    for i in range(len(right)):
+        a, b, c = knot[i], knot[i + 1], knot[i + 2]
+        right[i] = _under_hat(a - begin, b - begin, c - begin, felt)
+        # The cost of two hats is a sum over the bends of both: first of this one's, at the three
+        # knots of the other.
+        j = first[i]
+        before, here = _moments(a, b, c, knot[j], weight), _moments(a, b, c, knot[j + 1], weight)
+        for j in range(first[i], i + 1):
+            after = _moments(a, b, c, knot[j + 2], weight)
+            rises, falls = 1.0 / (knot[j + 1] - knot[j]), 1.0 / (knot[j + 2] - knot[j + 1])
+            rows[i, last - i + j] = rises * before - (rises + falls) * here + falls * after
             before, here = here, after
         # Rounding must not make the matrix indefinite.
-        band[above, i - 1] *= 1.0 + 1e-9
+        rows[i, last] *= 1.0 + 1e-9
+
+
+@kernel(allocates=False)
+def solve(first: NDArray[np.int64], rows: NDArray[np.float64], x: NDArray[np.float64]) -> bool:
+    """Solve such equations in place, by the matrix's Cholesky factor; False if it has none.
+
+    Parameters
+    ----------
+    first, rows
+        As in `normal_equations`; `rows` becomes the factor.
+    x : ndarray, shape (m - 2,)
+        The right sides; becomes the solution.
+    """
+    last = rows.shape[1] - 1
+    for i in range(len(x)):
+        row, square, value = rows[i], 0.0, x[i]
+        for j in range(first[i], i):
+            other, total = rows[j], row[last - i + j]
+            for k in range(max(first[i], first[j]), j):
+                total -= row[last - i + k] * other[last - j + k]
+            share = total / other[last]
+            row[last - i + j] = share
+            square += share * share
+            value -= share * x[j]
+        if not row[last] > square:
+            return False
+        row[last] = np.sqrt(row[last] - square)
+        x[i] = value / row[last]
+    for i in range(len(x) - 1, -1, -1):
+        row = rows[i]
+        x[i] /= row[last]
+        for j in range(first[i], i):
+            x[j] -= row[last - i + j] * x[i]
+    return True
 
 
 @kernel(force_inline=True, allocates=False)
@@ -117,12 +166,11 @@ def _under_hat(a: int, b: int, c: int, felt: NDArray[np.float64]) -> float:
 
 
 @kernel(force_inline=True, allocates=False)
-def _moments(knot: NDArray[np.int64], i: int, at: int, weight: Weight) -> float:
-    """Return the moments of the bends of the hat around knot i, seen from knot `at`."""
-    rises, falls = 1.0 / (knot[i] - knot[i - 1]), 1.0 / (knot[i + 1] - knot[i])
-    total = rises * _moment(abs(knot[at] - knot[i - 1]), weight)
-    total -= (rises + falls) * _moment(abs(knot[at] - knot[i]), weight)
-    return float(total + falls * _moment(abs(knot[at] - knot[i + 1]), weight))
+def _moments(a: int, b: int, c: int, at: int, weight: Weight) -> float:
+    """Return the moments of the bends of such a hat, seen from sample `at`."""
+    rises, falls = 1.0 / (b - a), 1.0 / (c - b)
+    total = rises * _moment(abs(at - a), weight) - (rises + falls) * _moment(abs(at - b), weight)
+    return float(total + falls * _moment(abs(at - c), weight))
 
 
 @kernel(force_inline=True, allocates=False)

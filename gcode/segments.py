@@ -16,9 +16,14 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solveh_banded
 
-from stillpath.gcode._least_squares_kernels import Weight, line_errors, normal_equations, reach
+from stillpath.gcode._least_squares_kernels import (
+    Weight,
+    line_errors,
+    normal_equations,
+    solve,
+    together,
+)
 from stillpath.gcode._segment_kernels import Bounds, choose_ends, path_directions
 from stillpath.gcode.timeline import Timeline
 from stillpath.models.modal import modal_form
@@ -241,14 +246,15 @@ class _Fit:
             return
         place = self._command_mm[:2, knot]
         shift = np.empty((2, len(inner)))
-        above, error = reach(knot, _LAGS), np.empty(knot[-1] - knot[0] + 1)
+        first, error = np.empty(len(inner), np.int64), np.empty(knot[-1] - knot[0] + 1)
+        rows = np.empty((len(inner), together(knot, _LAGS, first) + 1))
         for axis, cost in enumerate(self._filter.costs):
-            band = np.zeros((above + 1, len(inner)))
             line_errors(self._command_mm[axis], knot, error)
             # As they count, with those before and after.
             felt = np.convolve(error, cost.correlation)[_LAGS - 1 : 1 - _LAGS]
-            normal_equations(knot, cost, felt, band, shift[axis])
-            shift[axis] = solveh_banded(band, shift[axis], overwrite_ab=True, check_finite=False)
+            normal_equations(knot, first, cost, felt, rows, shift[axis])
+            if not solve(first, rows, shift[axis]):
+                raise np.linalg.LinAlgError("the ends of segments have no least squares")
         end_mm[:2, :-1] = self._grid_mm * np.round((place[:, 1:-1] + shift) / self._grid_mm)
         end_mm[3, :-1] += _filament(place, np.append(begin[3], end_mm[3]), shift)
 
