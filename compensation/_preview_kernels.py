@@ -28,21 +28,20 @@ def run_windows(
     `command_drive` and `state_drive` hold S y_d and H y_d with one row per window.
     """
     update, states = command_gain.shape
-    by_state, carried = command_gain.T.copy(), state_gain.T.copy()
-    following = np.empty(states)
+    carried = state_gain.T.copy()
+    following, before = np.empty(states), np.empty((last - first, states))
     for w in range(first, last):
-        out, drive = u[w * update : (w + 1) * update], command_drive[w]
-        for i in range(update):
-            out[i] = drive[i]
+        before[w - first] = z
         for i in range(states):
             following[i] = state_drive[w, i]
         for j in range(states):
-            value, gain = z[j], by_state[j]
-            for i in range(update):
-                out[i] += gain[i] * value
+            value = z[j]
             for i in range(states):
                 following[i] += carried[j, i] * value
         z[:] = following
+    # Only the states follow one after the other.
+    out = u[first * update : last * update].reshape(last - first, update)
+    out[:] = command_drive[first:last] + np.dot(before, command_gain.T)
 
 
 @kernel
