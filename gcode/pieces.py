@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillpath.gcode.types import (
+    AFTER_MARK,
     EventKind,
     Events,
     Limits,
@@ -73,6 +74,11 @@ class Piece(VerbatimPart):
     def planned(cls, lines: VerbatimPart, phases: Phases) -> Piece:
         """Return the lines of a verbatim part with the plan of its moves."""
         return cls(**{f.name: getattr(lines, f.name) for f in fields(lines)}, phases=phases)
+
+    @property
+    def after_mark(self) -> bool:
+        """Whether the firmware may come from elsewhere, because it skipped an object."""
+        return bool(self.moves.known[0] & AFTER_MARK)
 
     @property
     def marked_rows(self) -> NDArray[np.int64]:

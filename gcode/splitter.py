@@ -15,6 +15,7 @@ from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.pieces import Piece, VerbatimPart
 from stillpath.gcode.plan import plan_moves
 from stillpath.gcode.types import (
+    AFTER_MARK,
     KEPT,
     OF_STATE,
     EventKind,
@@ -38,6 +39,8 @@ PURGE_FEED_MM, PURGE_RATIO = 10.0, 5.0
 """A move that feeds more filament than the first, and per mm of path more than the second, counts
 as an extruder move: X and Y hardly move, and would be cut into thousands of segments."""
 
+SHORTEST_JUMP_MM = 0.1
+"""A shorter first move after an object's mark stays as sliced."""
 _AHEAD = 1.25
 """Time planned before a piece is cut, relative to its longest duration."""
 _MOST_MOVES, _MOST_EVENTS, _MOST_BYTES = 1 << 15, 1 << 16, 1 << 23
@@ -102,7 +105,8 @@ class Splitter:
             moves = _renumbered(moves, len(limits), len(modal))
             events = _renumbered(events, len(limits), len(modal))
         local = _shifted(events, -block.first_move)
-        raw = self._raw_moves(block, local)
+        raw = self._raw_moves(block)
+        moves = self._marked(moves, local, raw)
         if self._moves is None or self._events is None:
             self._moves, self._events, self._stays = moves, local, raw
             self._text, self._text_offset = block.text, block.text_offset
@@ -167,7 +171,7 @@ class Splitter:
                 break
         return int(events.move_index[end]) if end < count else None
 
-    def _raw_moves(self, block: ProgramBlock, events: Events) -> NDArray[np.bool_]:
+    def _raw_moves(self, block: ProgramBlock) -> NDArray[np.bool_]:
         """Mark moves of X or Y that must keep their lines, and all that bring back a state."""
         moves = block.moves
         travel, xy = moves.end_mm - moves.start_mm, moves.moves_xy
@@ -180,14 +184,6 @@ class Splitter:
         raw |= xy & (length > self._longest_s * moves.speed_mm_s)
         feed = np.abs(travel[:, 3])
         raw |= xy & (feed > PURGE_FEED_MM) & (feed > PURGE_RATIO * length)
-        # After an object mark the firmware may skip lines: keep that travel as sliced.
-        marks = events.move_index[events.kind == EventKind.OBJECT]
-        if self._after_mark:
-            marks = np.concatenate([[0], marks])
-        xy_rows = np.flatnonzero(xy)
-        following = np.searchsorted(xy_rows, marks)
-        self._after_mark = bool(np.any(following == len(xy_rows)))
-        raw[xy_rows[following[following < len(xy_rows)]]] = True
         if len(moves):
             # All segments of an arc share one line and are treated alike.
             starts = np.flatnonzero(np.append(True, np.diff(moves.line) != 0))
@@ -196,6 +192,26 @@ class Splitter:
             spread = np.maximum.reduceat(raw, starts) | ~xy[starts] | ~xy[ends - 1]
             raw = np.repeat(spread, ends - starts) & xy
         return np.asarray(raw | ((moves.known & OF_STATE) != 0))
+
+    def _marked(self, moves: Moves, events: Events, raw: NDArray[np.bool_]) -> Moves:
+        """Mark the first moves of X or Y after objects' marks: the firmware may jump there.
+
+        `raw` receives those that cannot be told apart from the jump.
+        """
+        marks = events.move_index[events.kind == EventKind.OBJECT]
+        if self._after_mark:
+            marks = np.concatenate([[0], marks])
+        xy_rows = np.flatnonzero(moves.moves_xy)
+        following = np.searchsorted(xy_rows, marks)
+        self._after_mark = bool(np.any(following == len(xy_rows)))
+        jumps = xy_rows[following[following < len(xy_rows)]]
+        way = np.abs(moves.end_mm[jumps, :2] - moves.start_mm[jumps, :2]).max(axis=1, initial=0.0)
+        same_line = np.append(np.diff(moves.line) == 0, False)
+        unfit = jumps[(way < SHORTEST_JUMP_MM) | same_line[jumps]]
+        raw[np.isin(moves.line, moves.line[unfit]) & moves.moves_xy] = True
+        known = moves.known.copy()
+        known[jumps] |= AFTER_MARK
+        return replace(moves, known=known)
 
     def _cut(self, *, final: bool) -> Iterator[Piece | VerbatimPart]:
         while self._moves is not None and self._events is not None:

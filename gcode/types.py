@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 __all__ = [
+    "AFTER_MARK",
     "KEPT",
     "OF_STATE",
     "EventKind",
@@ -33,6 +34,9 @@ KEPT = 8
 """Bit of `Moves.known`: the file asks that the move stays as it is."""
 OF_STATE = 16
 """Bit of `Moves.known`: the move's line depends on what the printer keeps (`EventKind.STATE`)."""
+AFTER_MARK = 32
+"""Bit of `Moves.known`: the first move of X or Y after an object's mark. If the firmware skipped
+the object before, it jumps from there to the end of this line."""
 
 
 class EventKind(IntEnum):
@@ -109,7 +113,7 @@ class Moves:
         Rows of `ProgramBlock.limits` and `ProgramBlock.modal` in force for the move.
     known : ndarray of uint8, shape (n,)
         Bit 0..2 set: the machine's x, y, z are known at both ends of the move; bits `KEPT`,
-        `OF_STATE`.
+        `OF_STATE`, `AFTER_MARK`.
     line, byte_start, byte_end : ndarray of int64, shape (n,)
         Source line; `byte_end` is one past its newline. An arc's pieces share one line.
     layer, feature, object_id : ndarray of int32, shape (n,)

@@ -61,7 +61,12 @@ from stillpath.pipeline.result import PutBack, Result, StageTime
 from stillpath.pipeline.selection import Selection, TooLarge
 from stillpath.pipeline.summary import Summary
 from stillpath.pipeline.totals import Totals
-from stillpath.pipeline.verbatim import plan_verbatim, switching_s, takes_s
+from stillpath.pipeline.verbatim import (
+    plan_verbatim,
+    stop_between_s,
+    switching_s,
+    takes_s,
+)
 from stillpath.pipeline.verifying import Verifier
 
 if TYPE_CHECKING:
@@ -210,13 +215,18 @@ class Job:
         if self._pairs is not None and self._budget is None:
             self._budget, begun = self._chosen_paces(size), _CHOSEN
         self._source.seek(0)
+        before: VerbatimPart | None = None
         for item in self._selected():
             self._point = self._operation.at(item.moves)
             self._measurement.operate_at(self._point)
             if isinstance(item, Piece):
+                if before is not None:
+                    with self._clock.stage("plan"):
+                        self._sum.original_s -= stop_between_s(before, item, self._machine)
                 self._piece(item)
             else:
                 self._verbatim(item)
+            before = item
             self._operation.passed(item.moves)
             # Not source.tell(): a whole block is read before its first piece is compensated.
             share = (item.text_offset + len(item.text)) / size
@@ -292,7 +302,7 @@ class Job:
             self._put_back(piece, refusal)
             return
         self._motion.begin(piece)
-        switched_s = self._switched_off_s()
+        led_s = self._led_s(piece)
         for paced in self._clock.each("plan", paces):
             try:
                 attempt = self._attempt(piece, paced)
@@ -302,7 +312,7 @@ class Job:
             except GcodeError as error:  # its line number is of the written text
                 reason = f"the firmware would refuse the compensated lines: {error.message}"
         else:
-            self._sum.time_s -= switched_s
+            self._sum.time_s -= led_s
             self._put_back(piece, reason)
             return
         self.compensated.append(lines)
@@ -321,13 +331,17 @@ class Job:
         late_s = attempt.made.encoded.row_start_s - (piece.phases.t_s - piece.phases.t_s[0])
         self._emit(attempt.text, piece, np.append(delay_s + late_s, self.delay_s))
 
-    def _switched_off_s(self) -> float:
-        """Count how long the machine stands while its shaper is switched off, and return it.
+    def _led_s(self, piece: Piece) -> float:
+        """Count how long the lines before the piece's stream take, and return it.
 
         This precedes the compensation of the piece: vibration dies down meanwhile.
         """
-        lines = self._writer.switching_off
-        seconds = switching_s(self._checker.snapshot().push(lines)) if lines else 0.0
+        lines = self._writer.leading(piece, self._checker.extruder_mm)
+        blocks = self._checker.snapshot().push(lines) if lines else []
+        seconds = switching_s(blocks)
+        for block in blocks:
+            if len(block.moves):
+                seconds += plan_moves(block.moves, block.limits, self._machine).duration_s
         if seconds > 0.0:
             self._motion.wait(seconds)
         return seconds
@@ -345,10 +359,13 @@ class Job:
             with self._clock.stage("compensate"):
                 made = self._work.compensate(paced, self._point)
             with self._clock.stage("write"):
-                text = self._writer.piece(piece, made.encoded, self._checker.extruder_mm)
+                fed_mm = self._checker.extruder_mm
+                lead = self._writer.leading(piece, fed_mm) if piece.after_mark else b""
+                text = self._writer.piece(piece, made.encoded, fed_mm)
             with self._clock.stage("read back"):
                 checker = self._checker.snapshot()
-                executed = self._read_back(text)
+                self._checker.push(lead)
+                executed = self._read_back(text[len(lead) :])
                 gap_mm = deviation(made, executed)
                 self._verifier.check_motion(piece, made, gap_mm, executed)
             with self._clock.stage("measure"):

@@ -10,10 +10,10 @@ import numpy as np
 from stillpath.gcode.firmware.planning import stops
 from stillpath.gcode.pieces import Piece, VerbatimPart
 from stillpath.gcode.plan import plan_moves
-from stillpath.gcode.types import EventKind, Phases, ProgramBlock, rows_of
+from stillpath.gcode.types import EventKind, Phases, ProgramBlock, joined, rows_of
 from stillpath.models.machine import Machine
 
-__all__ = ["plan_verbatim", "switching_s", "takes_s"]
+__all__ = ["plan_verbatim", "stop_between_s", "switching_s", "takes_s"]
 
 
 def plan_verbatim(verbatim: VerbatimPart, machine: Machine) -> Iterator[Phases | float | None]:
@@ -51,6 +51,29 @@ def plan_verbatim(verbatim: VerbatimPart, machine: Machine) -> Iterator[Phases |
 def takes_s(part: Phases | float | None) -> float:
     """Return the duration of a part of a verbatim part."""
     return part.duration_s if isinstance(part, Phases) else part or 0.0
+
+
+def stop_between_s(verbatim: VerbatimPart, piece: Piece, machine: Machine) -> float:
+    """Return by how much sooner the sliced file would be there without a stop before a piece.
+
+    Parameters
+    ----------
+    verbatim : VerbatimPart
+        What stands in front of it.
+    """
+    if isinstance(verbatim, Piece) or len(verbatim.moves) == 0:
+        return 0.0
+    stop = np.append(0, verbatim.events.move_index[stops(verbatim.events)]).max()
+    before = rows_of(verbatim.moves, slice(int(stop), None))
+    rests = np.flatnonzero(~piece.phases.moves_xy)
+    after = rows_of(piece.moves, slice(0, int(rests[0]) if len(rests) else None))
+    shifted = replace(after, limits_id=after.limits_id + len(verbatim.limits))
+    alone = [
+        plan_moves(before, verbatim.limits, machine).duration_s if len(before) else 0.0,
+        plan_moves(after, piece.limits, machine).duration_s,
+    ]
+    tables = [*verbatim.limits, *piece.limits]
+    return sum(alone) - plan_moves(joined([before, shifted]), tables, machine).duration_s
 
 
 def switching_s(parts: Iterable[VerbatimPart | ProgramBlock]) -> float:

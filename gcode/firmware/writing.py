@@ -6,9 +6,10 @@ firmware shaper) is set before its first line, and restored before any line that
 
 from __future__ import annotations
 
+import copy
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +17,9 @@ from numpy.typing import NDArray
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware._writing_kernels import format_moves
 from stillpath.gcode.firmware.base import FirmwareAdapter
-from stillpath.gcode.firmware.encoding import Encoded
+from stillpath.gcode.firmware.encoding import Encoded, to_units
 from stillpath.gcode.firmware.file_shapers import FileShapers
+from stillpath.gcode.firmware.jumps import jump_lines
 from stillpath.gcode.firmware.line_reader import (
     AXES,
     EXTRUSION,
@@ -27,6 +29,7 @@ from stillpath.gcode.firmware.line_reader import (
     STANDS,
     LineReader,
 )
+from stillpath.gcode.firmware.modes import WrittenModes, written_modes
 from stillpath.gcode.firmware.planning import stops
 from stillpath.gcode.pieces import LeftOut, Piece, VerbatimPart
 from stillpath.gcode.types import EventKind, Limits, ModalState
@@ -42,20 +45,6 @@ _MAY_SET_SHAPER = (EventKind.UNKNOWN, EventKind.SHAPER)
 _LEAST_GAP_MM = 1e-7
 _FAR_MM = 10.0
 """32-bit floats resolve a micrometre up to here."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Modes:
-    """Modal states of a piece's written moves: states[i] holds from move first[i] on.
-
-    They are the file's, except that our lines use absolute X Y Z and relative E.
-    """
-
-    first: NDArray[np.int64]
-    states: list[ModalState]
-
-    def at(self, move: int) -> ModalState:
-        return self.states[int(np.searchsorted(self.first, move, "right")) - 1]
 
 
 class StreamWriter:
@@ -108,9 +97,19 @@ class StreamWriter:
                 "not add up: in compensated stretches it is off, around them as the file sets it."
             )
 
+    def leading(self, piece: Piece, extruder_mm: float) -> bytes:
+        """Return lines that take time before a piece's stream, often none.
+
+        They switch the shaper off. After an object's mark they are all before the stream.
+        """
+        if not piece.after_mark:
+            return self._switching_off
+        other = copy.copy(self)
+        other._reads(extruder_mm)
+        return other._jump(piece)
+
     @property
-    def switching_off(self) -> bytes:
-        """Lines at the start of a piece that switch the shaper off; often none."""
+    def _switching_off(self) -> bytes:
         if self._streaming:
             return b""
         if self._shaper_off:
@@ -166,10 +165,10 @@ class StreamWriter:
         """Return the text of a compensated piece; `extruder_mm` as in `verbatim`."""
         self._reads(extruder_mm)
         limits, level = encoded.limits, encoded.level
-        parts = [self._on(piece, limits[level[0]])]
+        parts = [self._jump(piece) if piece.after_mark else self._on(piece, limits[level[0]])]
         rows, events = encoded.row, piece.events
         index = self._event_places(piece, encoded)
-        modes = self._modes(piece, index)
+        modes = written_modes(piece, index)
         text, line_end, extruded = self._format(encoded, modes, index, events.kind)
 
         kinds = events.kind.tolist()
@@ -225,22 +224,12 @@ class StreamWriter:
         first = np.minimum(first, np.minimum.accumulate(until[::-1])[::-1])
         return first[np.minimum(piece.events.move_index, len(piece.moves))]
 
-    def _modes(self, piece: Piece, index: NDArray[np.int64]) -> _Modes:
-        changes = piece.events.kind == EventKind.MODE
-        first = np.concatenate([[0], index[changes]])
-        states = [piece.modal_before]
-        states += [piece.modal[int(m)] for m in piece.events.modal_id[changes]]
-        # Of several changes at one move the last one counts.
-        last = np.append(first[1:] != first[:-1], True)
-        ours = [
-            replace(state, absolute_xyz=True, absolute_e=False)
-            for state, keep in zip(states, last, strict=True)
-            if keep
-        ]
-        return _Modes(first[last], ours)
-
     def _format(
-        self, encoded: Encoded, modes: _Modes, index: NDArray[np.int64], kinds: NDArray[np.int8]
+        self,
+        encoded: Encoded,
+        modes: WrittenModes,
+        index: NDArray[np.int64],
+        kinds: NDArray[np.int8],
     ) -> tuple[bytes, NDArray[np.int64], NDArray[np.float64]]:
         n = len(encoded.row)
         fresh = np.zeros(n + 1, dtype=bool)
@@ -258,7 +247,7 @@ class StreamWriter:
             encoded.feedrate_mm_min,
             np.repeat([m.extrude_factor for m in states], lengths),
             np.repeat([m.speed_factor for m in states], lengths),
-            np.repeat([_integer_origin(m) for m in states], lengths, axis=0),
+            np.repeat([to_units(np.array(m.origin_mm)) for m in states], lengths, axis=0),
             buffer,
             line_end,
             extruded,
@@ -376,14 +365,14 @@ class StreamWriter:
         return text
 
     def _on(self, piece: Piece, limits: Limits) -> bytes:
-        """Return the lines before the first segment of a piece."""
+        """Return the lines before the first move of a piece."""
         parts: list[bytes] = []
         if not self._at_rest:
             parts.append(self._stream_commands.stand_still)
         if not self._streaming:
             parts.append(b"; stillpath: stream on\n")
-            parts.append(self.switching_off)
-            self._shaper_off = self._shaper_off or bool(self.switching_off)
+            parts.append(self._switching_off)
+            self._shaper_off = self._shaper_off or bool(self._switching_off)
             self._marked, self._advances = None, False
             parts.append(self._stream_commands.limits(limits))
             self._limits_now = limits
@@ -391,6 +380,13 @@ class StreamWriter:
         if self._modal is None:
             self._modal = piece.modal_before
         return b"".join(parts)
+
+    def _jump(self, piece: Piece) -> bytes:
+        """Return the lines before a piece that follows an object's mark: to its begin, at rest."""
+        own = self._stream_commands.in_stream(piece.limits_before)
+        modes = replace(piece.modal_before, absolute_xyz=True, absolute_e=False)
+        text = self._on(piece, own) + self._enter_stream_state(own, modes) + jump_lines(piece)
+        return text + self._stream_commands.stand_still
 
     def _off(self, verbatim: VerbatimPart, extruder_mm: float) -> bytes:
         """Return lines that restore the file's state."""
@@ -493,7 +489,3 @@ def _held_back(line: bytes) -> bytes:
 def _feed_line(feedrate_mm_min: float) -> bytes:
     digits = f"{feedrate_mm_min:.5f}".rstrip("0").rstrip(".")
     return f"G1 F{digits}\n".encode()
-
-
-def _integer_origin(state: ModalState) -> NDArray[np.int64]:
-    return np.round(np.array(state.origin_mm) * 1e6).astype(np.int64)

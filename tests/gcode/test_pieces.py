@@ -114,21 +114,32 @@ MARKS_OF_ALL = [
     ],
 )
 def test_object_marks(firmware: str, a: str, b: str) -> None:
-    """A mark ends a piece, and the travel after it is not ours; the same object's does not."""
+    """A mark ends a piece, and the next one begins behind it; the same object's does not."""
     again = f"{a}\n" if a.startswith(";") else ""
-    jump = "G1 E-1\nG1 X20 Y20 F9000\nG1 E1\n"
+    jump = "G1 X20 Y20 F9000\nG1 E1\n"
     drawn = f"G1 X40 Y20 E1\n{again}G1 X40 Y40 E1\n"
     text = HEAD + (f"{b}\n" if again else "")
     text += f"{a}\nG1 X70 E1\nG1 X80 E1\n{again}G1 Y60 E1\n"
-    text += f"{b}\n{jump}{drawn.replace(a, b)}{a}\n{jump}{drawn}"
+    text += f"{b}\nG1 E-1\n{jump}{drawn.replace(a, b)}{a}\nG1 E-1\n{jump}{drawn}"
     items = cut(text.encode(), ender3_with(firmware))
     assert text_of(items) == text.encode()
-    pieces = [item.text for item in items if isinstance(item, Piece)]
-    assert pieces[1:] == [
-        f"G1 X80 E1\n{again}G1 Y60 E1\n".encode(),
-        drawn.replace(a, b).encode(),
-        drawn.encode(),
+    pieces = [item for item in items if isinstance(item, Piece)]
+    assert [piece.text for piece in pieces[1:]] == [
+        f"G1 X70 E1\nG1 X80 E1\n{again}G1 Y60 E1\n".encode(),
+        (jump + drawn.replace(a, b)).encode(),
+        (jump + drawn).encode(),
     ]
+    assert [piece.after_mark for piece in pieces] == [False, True, True, True]
+
+
+@pytest.mark.parametrize("jump", ["G1 X90.05", "G2 X95 Y95 I5 J0"])
+def test_what_may_not_come_after_a_jump_stays(machine: Machine, jump: str) -> None:
+    """An arc, and a move as short as what is written to catch a jump."""
+    text = HEAD + f"G1 X90 Y90 E1\n{EXCLUDED[0]}\n{jump}\nG1 X20 E1\nG1 Y40 E1\n"
+    items = cut(text.encode(), machine)
+    pieces = [item for item in items if isinstance(item, Piece)]
+    assert pieces[-1].text == b"G1 X20 E1\nG1 Y40 E1\n"
+    assert not pieces[-1].after_mark
 
 
 @pytest.mark.parametrize(

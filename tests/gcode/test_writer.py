@@ -156,13 +156,14 @@ def test_origin_moves(pipeline: Pipeline) -> None:
 def test_modal_f_is_restored(pipeline: Pipeline) -> None:
     """Raw lines without F after a piece run at the file's F, not at the stream's."""
     text = (
-        HEAD + ROUND + "G1 F1234\nG1 X90 Y90 E1\nM400\nEXCLUDE_OBJECT_START NAME=a\nG1 X20\nG28\n"
+        HEAD + ROUND + "G1 F1234\nG1 X90 Y90 E1\nM400\nEXCLUDE_OBJECT_START NAME=a\n"
+        "G1 X90.05\nG28\n"
     )
     original = tagged(text.encode())
     written = pipeline(original)
     after = {s.text.split(b" ;#")[0]: s for s in states(written, pipeline.machine)}
-    assert after[b"G1 X20"].speed_mm_s == pytest.approx(1234 / 60, rel=1e-6)
-    assert not after[b"G1 X20"].stream
+    assert after[b"G1 X90.05"].speed_mm_s == pytest.approx(1234 / 60, rel=1e-6)
+    assert not after[b"G1 X90.05"].stream
 
 
 def test_rest_lines_without_f(pipeline: Pipeline) -> None:

@@ -1,0 +1,31 @@
+"""Lines before a piece that follows an object's mark."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stillpath.gcode.firmware.encoding import UNITS_PER_MM, to_units
+from stillpath.gcode.pieces import Piece
+
+__all__ = ["jump_lines"]
+
+_ASIDE_UNITS = 1000
+"""1 um: a firmware that counts steps does not move, if it is there already."""
+
+
+def jump_lines(piece: Piece) -> bytes:
+    """Return two moves that end where a piece begins, for absolute X and Y.
+
+    A firmware that skipped the object before stands elsewhere, and gets here by the first move of X
+    or Y. That must not be one of a stream, under the stream's limits. Where nothing was skipped,
+    these moves go a micrometre towards the file's own and back.
+    """
+    begin, end = (to_units(at[0, :2]) for at in (piece.moves.start_mm, piece.moves.end_mm))
+    axis = int(np.argmax(np.abs(end - begin)))
+    aside = begin.copy()
+    aside[axis] += np.sign(end - begin)[axis] * _ASIDE_UNITS
+    state = piece.modal_before
+    origin = to_units(np.array(state.origin_mm[:2]))
+    feed_mm_min = float(piece.moves.speed_mm_s[0]) * 60.0 / state.speed_factor
+    places = ((at - origin) / UNITS_PER_MM for at in (aside, begin))
+    return b"".join(b"G1 X%.6f Y%.6f F%.3f\n" % (x, y, feed_mm_min) for x, y in places)
