@@ -346,8 +346,9 @@ class Result(_Figures):
     put_back_extruding_share: float
     """Their share of the extruding time, 0 to 1."""
     left_alone_s: float = 0.0
-    """Time of the moves that keep their own lines by rule [s]: those after homing or an object's
-    mark, steep ones, and others whose place or state is not known; reverted pieces not counted."""
+    """Time of the moves that keep their own lines by rule [s]: those after homing, of Z or the
+    extruder between streams, steep ones, and others whose place or state is not known; reverted
+    pieces not counted."""
     left_alone_extruding_s: float = 0.0
     """How much of that extrudes [s]."""
     left_out_s: float = 0.0

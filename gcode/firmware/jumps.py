@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from stillpath.gcode.firmware.encoding import UNITS_PER_MM, to_units
@@ -10,20 +12,28 @@ from stillpath.gcode.pieces import Piece
 __all__ = ["jump_lines"]
 
 _ASIDE_UNITS = 1000
-"""1 um: a firmware that counts steps does not move, if it is there already."""
+"""1 um."""
 
 
-def jump_lines(piece: Piece) -> bytes:
+def jump_lines(piece: Piece, step_mm: Sequence[float]) -> bytes:
     """Return two moves that end where a piece begins, for absolute X and Y.
 
     A firmware that skipped the object before stands elsewhere, and gets here by the first move of X
     or Y. That must not be one of a stream, under the stream's limits. Where nothing was skipped,
-    these moves go a micrometre towards the file's own and back.
+    these moves go a micrometre towards the file's own and back: no step of a motor.
+
+    Parameters
+    ----------
+    step_mm : sequence of float
+        Of x and y, to which the firmware rounds places; 0: it does not.
     """
     begin, end = (to_units(at[0, :2]) for at in (piece.moves.start_mm, piece.moves.end_mm))
     axis = int(np.argmax(np.abs(end - begin)))
-    aside = begin.copy()
-    aside[axis] += np.sign(end - begin)[axis] * _ASIDE_UNITS
+    aside, step = begin.copy(), step_mm[axis] * UNITS_PER_MM
+    way = int(np.sign(end - begin)[axis]) * _ASIDE_UNITS
+    if step > 0.0 and round((begin[axis] + way) / step) != round(begin[axis] / step):
+        way = -way
+    aside[axis] += way
     state = piece.modal_before
     origin = to_units(np.array(state.origin_mm[:2]))
     feed_mm_min = float(piece.moves.speed_mm_s[0]) * 60.0 / state.speed_factor

@@ -60,6 +60,7 @@ class StreamWriter:
         self._stream_commands = firmware.stream_commands()
         self._lines = LineReader(self._stream_commands)
         self._extruder_alone_stops = firmware.extruder_alone_stops
+        self._step_mm = firmware.step_mm
         self._limits_now: Limits | None = None
         """The planner's limits while streaming."""
         self._stamp = stamp
@@ -385,7 +386,11 @@ class StreamWriter:
         """Return the lines before a piece that follows an object's mark: to its begin, at rest."""
         own = self._stream_commands.in_stream(piece.limits_before)
         modes = replace(piece.modal_before, absolute_xyz=True, absolute_e=False)
-        text = self._on(piece, own) + self._enter_stream_state(own, modes) + jump_lines(piece)
+        text = (
+            self._on(piece, own)
+            + self._enter_stream_state(own, modes)
+            + jump_lines(piece, self._step_mm)
+        )
         return text + self._stream_commands.stand_still
 
     def _off(self, verbatim: VerbatimPart, extruder_mm: float) -> bytes:

@@ -71,6 +71,21 @@ def test_no_break_asks_for_more_than_the_motors_bear(
         assert found.ramp_mm_s <= bears.speed_step_mm_s + 10e-3 * bears.accel_mm_s2
 
 
+def test_an_excluded_object_changes_nothing_behind_it(
+    written: tuple[Path, Machine], tmp_path: Path
+) -> None:
+    """The host goes on to the next one, and prints the last as if nothing had been excluded."""
+    file, machine = written
+    whole, excluded, _ = (
+        run(text, machine, tmp_path).sampled(SAMPLE_S, machine.kinematics == "corexy")
+        for text in (file.read_text(), *disturbed(file.read_text(), "EXCLUDE_OBJECT", 2))
+    )
+    assert excluded.shape[1] < whole.shape[1] - round(4.0 / SAMPLE_S)
+    # The last object lasts 4.4 s; 0.04 mm is what a sample of time makes at the fastest line.
+    tail = round(4.3 / SAMPLE_S)
+    assert np.abs(excluded[:, -tail:] - whole[:, -tail:]).max() < 0.04
+
+
 def test_the_host_moves_as_we_read_the_file_back(
     written: tuple[Path, Machine], tmp_path: Path
 ) -> None:

@@ -134,7 +134,7 @@ function putBack(report, channels) {
   if (report.advice || isLive(report) || !channels.some((c) => c.name === "after")) return null;
   const pieces = report.put_back;
   const byChoice = report.left_out_s ? h("p", null, `By choice (${report.settings.where}) ${duration(report.left_out_s)} of the print, ${duration(report.left_out_extruding_s)} of it extruding, stay as sliced.`) : null;
-  const byRule = h("p", null, `By rule, ${duration(report.left_alone_s || 0)} of the print (${(100 * (report.left_alone_s || 0) / (report.time_s || 1)).toFixed(2)} %), ${duration(report.left_alone_extruding_s || 0)} of it extruding, keep the file's own lines: after homing, for example, after an object's mark, or where a move is steep.`);
+  const byRule = h("p", null, `By rule, ${duration(report.left_alone_s || 0)} of the print (${(100 * (report.left_alone_s || 0) / (report.time_s || 1)).toFixed(2)} %), ${duration(report.left_alone_extruding_s || 0)} of it extruding, keep the file's own lines: after homing, for example, or where a move is steep.`);
   if (report.pieces === 0) return section("Reverted to the sliced lines", h("p", null, "Nothing: no piece of the file was to be compensated."));
   if (pieces.length === 0) return section("Reverted to the sliced lines", h("p", null, `Nothing: ${report.pieces === 1 ? "the one piece was" : `all ${grouped(report.pieces)} pieces were`} verified and compensated.`), byChoice, byRule);
   return section("Reverted to the sliced lines",
