@@ -215,18 +215,13 @@ class Job:
         if self._pairs is not None and self._budget is None:
             self._budget, begun = self._chosen_paces(size), _CHOSEN
         self._source.seek(0)
-        before: VerbatimPart | None = None
         for item in self._selected():
             self._point = self._operation.at(item.moves)
             self._measurement.operate_at(self._point)
             if isinstance(item, Piece):
-                if before is not None:
-                    with self._clock.stage("plan"):
-                        self._sum.original_s -= stop_between_s(before, item, self._machine)
                 self._piece(item)
             else:
                 self._verbatim(item)
-            before = item
             self._operation.passed(item.moves)
             # Not source.tell(): a whole block is read before its first piece is compensated.
             share = (item.text_offset + len(item.text)) / size
@@ -281,7 +276,13 @@ class Job:
             )
 
     def _selected(self) -> Iterator[Piece | VerbatimPart]:
+        previous: VerbatimPart | None = None
         for item in FileParts(self._source, self._reader, self._splitter, self._clock):
+            if isinstance(item, Piece) and previous is not None:
+                # The sliced file does not stop in front of it.
+                with self._clock.stage("plan"):
+                    self._sum.original_s -= stop_between_s(previous, item, self._machine)
+            previous = item
             before_s, names = self._sum.original_s, self._reader.feature_names
             yield from self._clock.each("plan", self._selection.divide(item, names))
             if isinstance(item, Piece) and self._options.where != "all":
