@@ -39,7 +39,7 @@ PURGE_FEED_MM, PURGE_RATIO = 10.0, 5.0
 """A move that feeds more filament than the first, and per mm of path more than the second, counts
 as an extruder move: X and Y hardly move, and would be cut into thousands of segments."""
 
-SHORTEST_JUMP_MM = 0.1
+_SHORTEST_JUMP_MM = 0.1
 """A shorter first move after an object's mark stays as sliced."""
 _AHEAD = 1.25
 """Time planned before a piece is cut, relative to its longest duration."""
@@ -207,7 +207,7 @@ class Splitter:
         jumps = xy_rows[following[following < len(xy_rows)]]
         way = np.abs(moves.end_mm[jumps, :2] - moves.start_mm[jumps, :2]).max(axis=1, initial=0.0)
         same_line = np.append(np.diff(moves.line) == 0, False)
-        unfit = jumps[(way < SHORTEST_JUMP_MM) | same_line[jumps]]
+        unfit = jumps[(way < _SHORTEST_JUMP_MM) | same_line[jumps]]
         raw[np.isin(moves.line, moves.line[unfit]) & moves.moves_xy] = True
         known = moves.known.copy()
         known[jumps] |= AFTER_MARK

@@ -61,12 +61,7 @@ from stillpath.pipeline.result import PutBack, Result, StageTime
 from stillpath.pipeline.selection import Selection, TooLarge
 from stillpath.pipeline.summary import Summary
 from stillpath.pipeline.totals import Totals
-from stillpath.pipeline.verbatim import (
-    plan_verbatim,
-    stop_between_s,
-    switching_s,
-    takes_s,
-)
+from stillpath.pipeline.verbatim import plan_verbatim, stop_between_s, switching_s, takes_s
 from stillpath.pipeline.verifying import Verifier
 
 if TYPE_CHECKING:

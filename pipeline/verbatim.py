@@ -65,11 +65,13 @@ def stop_between_s(verbatim: VerbatimPart, piece: Piece, machine: Machine) -> fl
         return 0.0
     stop = np.append(0, verbatim.events.move_index[stops(verbatim.events)]).max()
     before = rows_of(verbatim.moves, slice(int(stop), None))
+    if len(before) == 0:
+        return 0.0
     rests = np.flatnonzero(~piece.phases.moves_xy)
     after = rows_of(piece.moves, slice(0, int(rests[0]) if len(rests) else None))
     shifted = replace(after, limits_id=after.limits_id + len(verbatim.limits))
     alone = [
-        plan_moves(before, verbatim.limits, machine).duration_s if len(before) else 0.0,
+        plan_moves(before, verbatim.limits, machine).duration_s,
         plan_moves(after, piece.limits, machine).duration_s,
     ]
     tables = [*verbatim.limits, *piece.limits]

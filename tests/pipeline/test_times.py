@@ -58,6 +58,17 @@ def test_kept_times_and_the_method_none(tmp_path: Path, cache: Path) -> None:
     assert b"\n".join(lines) + b"\n" == TEXT
 
 
+def test_what_is_sliced_does_not_stop_before_a_piece(tmp_path: Path, cache: Path) -> None:
+    """After a mark a piece begins behind a move of Z, from which Klipper goes on without a stop."""
+    marks = "EXCLUDE_OBJECT_START NAME={}\nG1 Z{} F600\n"
+    layers = [f"{marks.format('ab'[k % 2], 0.4 + 0.2 * k)}{LAYER}\nG1 E-1\n" for k in range(8)]
+    text = f"{HEAD}G1 X120 Y100 F6000\nG1 E-1 F2100\n{''.join(layers)}".encode()
+    written, _ = compensated(text, tmp_path, cache)
+    sliced, _ = compensated(text, tmp_path, cache, method="none")
+    assert written.original_time_s == pytest.approx(sliced.original_time_s, abs=2e-3)
+    assert written.pieces >= 8
+
+
 def test_plan_and_simulate_tell_the_slicers_time(tmp_path: Path, cache: Path) -> None:
     source = tmp_path / "in.gcode"
     source.write_bytes(TEXT)
