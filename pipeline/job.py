@@ -61,7 +61,7 @@ from stillpath.pipeline.result import PutBack, Result, StageTime
 from stillpath.pipeline.selection import Selection, TooLarge
 from stillpath.pipeline.summary import Summary
 from stillpath.pipeline.totals import Totals
-from stillpath.pipeline.verbatim import plan_verbatim, stop_between_s, switching_s, takes_s
+from stillpath.pipeline.verbatim import flowing_s, plan_verbatim, switching_s, takes_s
 from stillpath.pipeline.verifying import Verifier
 
 if TYPE_CHECKING:
@@ -120,6 +120,7 @@ class Job:
         machine, options = order.machine, order.options
         self._order, self._layers = order, layers
         self.compensated: list[tuple[int, int]] = []
+        self._previous: VerbatimPart | None = None
         self._source, self._target = source, target
         self._machine, self._options = machine, options
         self._reports = ProgressReports(order.progress)
@@ -217,6 +218,7 @@ class Job:
                 self._piece(item)
             else:
                 self._verbatim(item)
+            self._previous = item
             self._operation.passed(item.moves)
             # Not source.tell(): a whole block is read before its first piece is compensated.
             share = (item.text_offset + len(item.text)) / size
@@ -273,10 +275,11 @@ class Job:
     def _selected(self) -> Iterator[Piece | VerbatimPart]:
         previous: VerbatimPart | None = None
         for item in FileParts(self._source, self._reader, self._splitter, self._clock):
-            if isinstance(item, Piece) and previous is not None:
+            if isinstance(item, Piece) and not isinstance(previous, Piece):
                 # The sliced file does not stop in front of it.
                 with self._clock.stage("plan"):
-                    self._sum.original_s -= stop_between_s(previous, item, self._machine)
+                    alone_s = flowing_s(None, item, self._machine)
+                    self._sum.original_s += flowing_s(previous, item, self._machine) - alone_s
             previous = item
             before_s, names = self._sum.original_s, self._reader.feature_names
             yield from self._clock.each("plan", self._selection.divide(item, names))
@@ -332,14 +335,11 @@ class Job:
 
         This precedes the compensation of the piece: vibration dies down meanwhile.
         """
-        lines = self._writer.leading(piece, self._checker.extruder_mm)
+        lines = self._writer.leading(piece)
         blocks = self._checker.snapshot().push(lines) if lines else []
         seconds = switching_s(blocks)
-        for block in blocks:
-            if len(block.moves):
-                seconds += plan_moves(block.moves, block.limits, self._machine).duration_s
-        if seconds > 0.0:
-            self._motion.wait(seconds)
+        seconds += sum(flowing_s(self._previous, b, self._machine) for b in blocks if len(b.moves))
+        self._motion.wait(seconds)
         return seconds
 
     def _attempt(self, piece: Piece, paced: Piece) -> Attempt:
@@ -355,9 +355,8 @@ class Job:
             with self._clock.stage("compensate"):
                 made = self._work.compensate(paced, self._point)
             with self._clock.stage("write"):
-                fed_mm = self._checker.extruder_mm
-                lead = self._writer.leading(piece, fed_mm) if piece.after_mark else b""
-                text = self._writer.piece(piece, made.encoded, fed_mm)
+                lead = self._writer.leading(piece) if piece.after_mark else b""
+                text = self._writer.piece(piece, made.encoded, self._checker.extruder_mm)
             with self._clock.stage("read back"):
                 checker = self._checker.snapshot()
                 self._checker.push(lead)

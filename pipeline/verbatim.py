@@ -13,7 +13,7 @@ from stillpath.gcode.plan import plan_moves
 from stillpath.gcode.types import EventKind, Phases, ProgramBlock, joined, rows_of
 from stillpath.models.machine import Machine
 
-__all__ = ["plan_verbatim", "stop_between_s", "switching_s", "takes_s"]
+__all__ = ["flowing_s", "plan_verbatim", "switching_s", "takes_s"]
 
 
 def plan_verbatim(verbatim: VerbatimPart, machine: Machine) -> Iterator[Phases | float | None]:
@@ -53,29 +53,29 @@ def takes_s(part: Phases | float | None) -> float:
     return part.duration_s if isinstance(part, Phases) else part or 0.0
 
 
-def stop_between_s(verbatim: VerbatimPart, piece: Piece, machine: Machine) -> float:
-    """Return by how much sooner the sliced file would be there without a stop before a piece.
+def flowing_s(
+    before: VerbatimPart | None, after: VerbatimPart | ProgramBlock, machine: Machine
+) -> float:
+    """Return how much later moves end than those before them, if nothing stops in between.
 
     Parameters
     ----------
-    verbatim : VerbatimPart
-        What stands in front of it.
+    before : VerbatimPart, optional
+        Its moves behind its last stop count.
+    after : VerbatimPart or ProgramBlock
+        Its moves up to the first that does not move X or Y.
     """
-    if isinstance(verbatim, Piece) or len(verbatim.moves) == 0:
-        return 0.0
-    stop = np.append(0, verbatim.events.move_index[stops(verbatim.events)]).max()
-    before = rows_of(verbatim.moves, slice(int(stop), None))
-    if len(before) == 0:
-        return 0.0
-    rests = np.flatnonzero(~piece.phases.moves_xy)
-    after = rows_of(piece.moves, slice(0, int(rests[0]) if len(rests) else None))
-    shifted = replace(after, limits_id=after.limits_id + len(verbatim.limits))
-    alone = [
-        plan_moves(before, verbatim.limits, machine).duration_s,
-        plan_moves(after, piece.limits, machine).duration_s,
-    ]
-    tables = [*verbatim.limits, *piece.limits]
-    return sum(alone) - plan_moves(joined([before, shifted]), tables, machine).duration_s
+    rests = np.flatnonzero(~after.moves.moves_xy)
+    moves = rows_of(after.moves, slice(0, int(rests[0]) if len(rests) else None))
+    if before is None or isinstance(before, Piece) or len(before.moves) == 0:
+        return plan_moves(moves, after.limits, machine).duration_s
+    stop = np.append(0, before.events.move_index[stops(before.events)]).max()
+    tail = rows_of(before.moves, slice(int(stop), None))
+    if len(tail) == 0:
+        return plan_moves(moves, after.limits, machine).duration_s
+    moves = replace(moves, limits_id=moves.limits_id + len(before.limits))
+    whole = plan_moves(joined([tail, moves]), [*before.limits, *after.limits], machine)
+    return whole.duration_s - plan_moves(tail, before.limits, machine).duration_s
 
 
 def switching_s(parts: Iterable[VerbatimPart | ProgramBlock]) -> float:

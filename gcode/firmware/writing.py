@@ -98,16 +98,12 @@ class StreamWriter:
                 "not add up: in compensated stretches it is off, around them as the file sets it."
             )
 
-    def leading(self, piece: Piece, extruder_mm: float) -> bytes:
+    def leading(self, piece: Piece) -> bytes:
         """Return lines that take time before a piece's stream, often none.
 
         They switch the shaper off. After an object's mark they are all before the stream.
         """
-        if not piece.after_mark:
-            return self._switching_off
-        other = copy.copy(self)
-        other._reads(extruder_mm)
-        return other._jump(piece)
+        return copy.copy(self)._lead(piece) if piece.after_mark else self._switching_off
 
     @property
     def _switching_off(self) -> bytes:
@@ -166,7 +162,7 @@ class StreamWriter:
         """Return the text of a compensated piece; `extruder_mm` as in `verbatim`."""
         self._reads(extruder_mm)
         limits, level = encoded.limits, encoded.level
-        parts = [self._jump(piece) if piece.after_mark else self._on(piece, limits[level[0]])]
+        parts = [self._on(piece, limits[level[0]])]
         rows, events = encoded.row, piece.events
         index = self._event_places(piece, encoded)
         modes = written_modes(piece, index)
@@ -366,32 +362,40 @@ class StreamWriter:
         return text
 
     def _on(self, piece: Piece, limits: Limits) -> bytes:
-        """Return the lines before the first move of a piece."""
+        """Return the lines before the first segment of a piece."""
+        if self._streaming:
+            return self._lead(piece)
+        self._limits_now = limits
+        return self._lead(piece) + self._stream_commands.limits(limits)
+
+    def _lead(self, piece: Piece) -> bytes:
+        """Return those of them that still move under the file's limits, or stand."""
         parts: list[bytes] = []
-        if not self._at_rest:
+        if not (self._at_rest or piece.after_mark):
             parts.append(self._stream_commands.stand_still)
-        if not self._streaming:
-            parts.append(b"; stillpath: stream on\n")
-            parts.append(self._switching_off)
-            self._shaper_off = self._shaper_off or bool(self._switching_off)
-            self._marked, self._advances = None, False
-            parts.append(self._stream_commands.limits(limits))
-            self._limits_now = limits
-            self._streaming = True
         if self._modal is None:
             self._modal = piece.modal_before
+        if not self._streaming:
+            parts.append(b"; stillpath: stream on\n")
+            if piece.after_mark:
+                parts.append(self._jump(piece))
+            parts.append(self._switching_off)
+            if piece.after_mark:
+                # Klipper waits longer if it has to stand before it switches its shaper off.
+                parts.append(self._stream_commands.stand_still)
+            self._shaper_off = self._shaper_off or bool(self._switching_off)
+            self._marked, self._advances = None, False
+            self._streaming = True
         return b"".join(parts)
 
     def _jump(self, piece: Piece) -> bytes:
-        """Return the lines before a piece that follows an object's mark: to its begin, at rest."""
-        own = self._stream_commands.in_stream(piece.limits_before)
-        modes = replace(piece.modal_before, absolute_xyz=True, absolute_e=False)
-        text = (
-            self._on(piece, own)
-            + self._enter_stream_state(own, modes)
-            + jump_lines(piece, self._step_mm)
-        )
-        return text + self._stream_commands.stand_still
+        """Return lines to where a piece begins, behind an object's mark."""
+        own = piece.limits_before
+        if self._shaper_off:
+            own = self._stream_commands.in_stream(own)
+        text = self._stream_commands.limits(own)
+        text += self._file_modes(replace(piece.modal_before, absolute_xyz=True, absolute_e=False))
+        return text + jump_lines(piece, self._step_mm)
 
     def _off(self, verbatim: VerbatimPart, extruder_mm: float) -> bytes:
         """Return lines that restore the file's state."""
