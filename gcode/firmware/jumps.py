@@ -20,7 +20,8 @@ def jump_lines(piece: Piece, step_mm: Sequence[float]) -> bytes:
 
     A firmware that skipped the object before stands elsewhere, and gets here by the first move of X
     or Y. That must not be one of a stream, under the stream's limits. Where nothing was skipped,
-    these moves go a micrometre towards the file's own and back: no step of a motor.
+    these moves go a micrometre towards the file's own and back: no step of X or Y, but on a CoreXY
+    that counts steps a motor may make one.
 
     Parameters
     ----------
