@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.fbf import PreviewFbf
-from stillpath.compensation.preview_axis import GENTLE_RUNG
+from stillpath.compensation.ladder import GENTLE_RUNG
 from stillpath.compensation.shapers import ShaperCompensator
 from stillpath.models.arrays import Array
 from stillpath.models.machine import Machine

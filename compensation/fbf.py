@@ -23,18 +23,20 @@ from stillpath.compensation._sliding_kernels import contour_square
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.basis import BASES
 from stillpath.compensation.defaults import DEFAULT_BASIS
-from stillpath.compensation.minimax import guarded_weights
-from stillpath.compensation.preview_axis import (
+from stillpath.compensation.ladder import (
     GENTLE_RUNG,
     LADDER,
+    Rung,
+    designs,
+    functions_within,
+)
+from stillpath.compensation.minimax import guarded_weights
+from stillpath.compensation.preview_axis import (
     WEIGHT_REST,
     WEIGHT_TRAVEL,
     AxisCommand,
     AxisTask,
     PreviewAxis,
-    Rung,
-    designs,
-    functions_within,
 )
 from stillpath.compensation.sliding import balanced_weights, slide
 from stillpath.compensation.window_problem import Bounds, Extremes
@@ -326,12 +328,10 @@ class PreviewFbf:
             reached = Extremes.of(command, command[0], command[0], stops=True)
             rms = np.sqrt(reached.mean_square) / dt**2
             if rms > task.rms_limit_mm_s2 and rung < GENTLE_RUNG:
+                axis.refuse(rung, task, rms)
                 break
             if bounds.kept(reached):
-                # The next piece starts here, or on a more accurate rung if there is room.
-                has_room = rms < 0.8 * task.rms_limit_mm_s2 or rung > GENTLE_RUNG
-                if len(command) > axis.update:
-                    axis.next_rung = max(0, rung - 1) if has_room else rung
+                axis.accept(rung, task, rms)
                 return found, rung, careful
             outside = axis.windows_outside(bounds, command)
             few = len(careful | outside) <= max(2, _BOUNDED_SHARE * len(command) / axis.update)

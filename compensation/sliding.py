@@ -18,14 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillpath.compensation._sliding_kernels import contour_square, move_targets
+from stillpath.compensation.ladder import Designs
 from stillpath.compensation.lifted_window import lifted_window
-from stillpath.compensation.preview_axis import (
-    WEIGHT_TRAVEL,
-    AxisCommand,
-    AxisTask,
-    Designs,
-    PreviewAxis,
-)
+from stillpath.compensation.preview_axis import WEIGHT_TRAVEL, AxisCommand, AxisTask, PreviewAxis
 from stillpath.compensation.window_problem import Bounds
 from stillpath.models.arrays import Array
 from stillpath.models.plants import DiscretePlant

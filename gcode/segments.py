@@ -104,8 +104,8 @@ class ErrorFilter:
     Notes
     -----
     `share` is the share of the tolerance that is used: all of it up to a resonance of `FULL_GAIN`.
-    The response to an error e is direct e + sum of Re(weight x) with x <- pole x + e. `costs` says
-    for each axis how errors count: by the energy of that response.
+    The response to an error e is direct e + sum of Re(weight x) with x <- pole x + e. `cost` says
+    how errors count: by the energy of that response.
     """
 
     def __init__(self, plants: Sequence[DiscretePlant]) -> None:
@@ -121,9 +121,8 @@ class ErrorFilter:
             if len(form) or plant.order == 0:
                 direct[i] = plant.d
         self.pole, self.weight, self.direct = pole, weight, direct
-        self.costs = [
-            _cost(*axis) for axis in zip(pole, weight, direct + BEYOND_MODEL, strict=True)
-        ]
+        forms_of = zip(pole, weight, direct + BEYOND_MODEL, strict=True)
+        self.cost = weighing(np.stack([_correlation(*form) for form in forms_of], axis=1))
         self.share = float(np.clip(FULL_GAIN / _peak_gain(pole, weight, direct), 0.5, 1.0))
 
 
@@ -244,19 +243,19 @@ class _Fit:
         inner = knot[1:-1]
         if len(inner) == 0:
             return
-        place = self._command_mm[:2, knot]
-        shift = np.empty((2, len(inner)))
-        first, error = np.empty(len(inner), np.int64), np.empty(knot[-1] - knot[0] + 1)
-        rows = np.empty((len(inner), together(knot, _LAGS, first) + 1))
-        for axis, cost in enumerate(self._filter.costs):
+        place, cost = self._command_mm[:2, knot], self._filter.cost
+        first, felt = np.empty(len(inner), np.int64), np.empty((2, knot[-1] - knot[0] + 1))
+        for axis, error in enumerate(felt):
             line_errors(self._command_mm[axis], knot, error)
             # As they count, with those before and after.
-            felt = np.convolve(error, cost.correlation)[_LAGS - 1 : 1 - _LAGS]
-            normal_equations(knot, first, cost, felt, rows, shift[axis])
-            if not solve(first, rows, shift[axis]):
-                raise np.linalg.LinAlgError("the ends of segments have no least squares")
-        end_mm[:2, :-1] = self._grid_mm * np.round((place[:, 1:-1] + shift) / self._grid_mm)
-        end_mm[3, :-1] += _filament(place, np.append(begin[3], end_mm[3]), shift)
+            error[:] = np.convolve(error, cost.correlation[:, axis])[_LAGS - 1 : 1 - _LAGS]
+        rows = np.empty((len(inner), together(knot, _LAGS, first) + 1, 2))
+        shift = np.empty((len(inner), 2))
+        normal_equations(knot, first, cost, felt, rows, shift)
+        if not solve(first, rows, shift):
+            raise np.linalg.LinAlgError("the ends of segments have no least squares")
+        end_mm[:2, :-1] = self._grid_mm * np.round((place[:, 1:-1] + shift.T) / self._grid_mm)
+        end_mm[3, :-1] += _filament(place, np.append(begin[3], end_mm[3]), shift.T)
 
     def segments(self) -> Segments:
         """Return the fitted segments."""
@@ -322,10 +321,10 @@ def _peak_gain(
     return float(np.max(np.abs(direct[:, None] + 0.5 * sums.sum(axis=2))))
 
 
-def _cost(
+def _correlation(
     pole: NDArray[np.complex128], weight: NDArray[np.complex128], direct: np.float64
-) -> Weight:
-    """Return how errors of an axis count."""
+) -> NDArray[np.float64]:
+    """Return how errors of an axis count together, by the lag between them, shape (lags,)."""
     lag = np.arange(_LAGS)
     power = pole ** lag[:, None]
     # Summed products of two responses: a geometric series for every pair of poles.
@@ -337,16 +336,16 @@ def _cost(
     impulse = np.append(direct, (power[:-1] @ weight).real)
     correlation = (power @ (weight * pairs)).real + direct * impulse
     # A triangle's spectrum is nowhere negative, nor is that of its product with a correlation.
-    return weighing(correlation * (1.0 - lag / _LAGS))
+    return np.asarray(correlation * (1.0 - lag / _LAGS))
 
 
 def weighing(correlation: NDArray[np.float64]) -> Weight:
-    """Return the weight of errors with this correlation, shape (lags,), and its moments."""
+    """Return the weight of errors with this correlation, shape (lags, 2), and its moments."""
     lags = len(correlation)
-    bend, moment = np.zeros((2, lags + 3))
+    bend, moment = np.zeros((2, lags + 3, 2))
     bend[1] = 0.5 * correlation[0]
     for k in range(1, lags + 2):
         bend[k + 1] = 2.0 * bend[k] - bend[k - 1] + (correlation[k] if k < lags else 0.0)
         moment[k + 1] = 2.0 * moment[k] - moment[k - 1] + bend[k]
-    both_sides = np.append(correlation[:0:-1], correlation)
+    both_sides = np.concatenate([correlation[:0:-1], correlation])
     return Weight(both_sides, moment[: lags + 2], bend[lags : lags + 2].copy())

@@ -33,6 +33,7 @@ from stillpath.compensation.base import DesignError
 from stillpath.compensation.basis import BASES, ZERO
 from stillpath.compensation.defaults import DEFAULT_BASIS
 from stillpath.compensation.fbf import ROBUST, UPDATE_S, WINDOW_S, PreviewFbf
+from stillpath.compensation.ladder import Designs, designs, functions_within
 from stillpath.compensation.lifted import LiftedSet, integrated, lift, lifted_set
 from stillpath.compensation.lifted_window import LiftedWindow, lifted_window
 from stillpath.compensation.metrics import (
@@ -43,7 +44,6 @@ from stillpath.compensation.metrics import (
     robust_error_of_spread,
 )
 from stillpath.compensation.nominal import two_step
-from stillpath.compensation.preview_axis import Designs, designs, functions_within
 from stillpath.compensation.shapers import SHAPERS
 from stillpath.models.arrays import Array
 from stillpath.models.machine import Machine

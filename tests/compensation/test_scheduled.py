@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from stillpath.compensation.base import Compensator, DesignError
 from stillpath.compensation.fbf import LADDER, PreviewFbf
-from stillpath.compensation.preview_axis import BAND_MARGIN, functions_within
+from stillpath.compensation.ladder import BAND_MARGIN, functions_within
 from stillpath.compensation.registry import compensator
 from stillpath.compensation.scheduled import BLEND_STEP, DESIGN_STEP, ScheduledCompensator
 from stillpath.models.machine import CommandLimits, Machine
