@@ -13,6 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from stillpath.models.arrays import Array
+from stillpath.pipeline.measuring._maxima_kernels import above, ringing
 from stillpath.pipeline.measuring.points import MotionSamples
 from stillpath.simulation.measures import ChosenMeter
 
@@ -21,6 +22,8 @@ __all__ = ["RINGING_S", "Maxima"]
 RINGING_S = 0.1
 """Time after the end of a line in which ringing counts."""
 _STILL_MM = 1e-9
+_NO_FEATURE = -2
+"""Of samples that do not extrude."""
 
 
 class Maxima:
@@ -42,8 +45,8 @@ class Maxima:
 
     def __init__(self, dt_s: float, channels: int, exact: int | None = None) -> None:
         self._exact = exact
-        self._pending = np.zeros((3, 0), np.int64)
-        """Extrusion, layer and feature of the samples without responses yet."""
+        self._pending = np.zeros((2, 0), np.int32)
+        """Layer and feature of the samples without responses yet."""
         self._errors = ChosenMeter(dt_s, channels=channels)
         self._reach = round(RINGING_S / dt_s)
         self._index = np.zeros(0, np.int64)
@@ -64,57 +67,64 @@ class Maxima:
 
     def add(self, samples: MotionSamples) -> None:
         """Add motion whose responses follow later (`answered`)."""
-        n = len(samples)
+        n, moves = len(samples), samples.moves
         path = samples.path_mm
+        marks = np.stack([moves.layer, moves.feature])
         if self._exact is not None:
-            marks = np.stack([samples.moves.layer, samples.moves.feature])[:, samples.row]
-            known = np.concatenate([samples.extruding[None], marks], dtype=np.int64)
-            self._pending = np.append(self._pending, known, axis=1)
-        before = path[:, :1] if self._at is None else self._at
-        moves = np.any(np.abs(np.diff(path, axis=1, prepend=before)) > _STILL_MM, axis=0)
-        here = np.arange(n)
-        printed = np.maximum.accumulate(np.where(samples.extruding, here, self._printed))
-        moved = np.maximum.accumulate(np.where(moves, here, self._moved))
-        # The last sample of a line may lie just before its end.
-        chosen = np.flatnonzero(
-            ~samples.extruding & (here - printed <= self._reach) & (moved <= printed + 1)
+            pending = marks[:, samples.row]
+            pending[1, ~samples.extruding] = _NO_FEATURE
+            self._pending = np.append(self._pending, pending, axis=1)
+        before = path[:, 0] if self._at is None else self._at
+        found = np.empty((2, n), np.int64)
+        count, printed, moved = ringing(
+            path,
+            samples.extruding,
+            before,
+            _STILL_MM,
+            self._reach,
+            self._printed,
+            self._moved,
+            found,
         )
+        chosen, line = found[:, :count]
         if len(chosen):
             self._index = np.append(self._index, self._added + chosen)
-            of = np.stack([samples.moves.layer, samples.moves.feature])
-            of = of[:, samples.row[np.maximum(printed[chosen], 0)]]
-            of = np.where(printed[chosen] >= 0, of, np.array(self._of)[:, None])
+            of = np.where(
+                line >= 0, marks[:, samples.row[np.maximum(line, 0)]], np.array(self._of)[:, None]
+            )
             self._groups = np.append(self._groups, of.astype(np.int64), axis=1)
-        if printed[-1] >= 0:
-            row = samples.row[printed[-1]]
-            self._of = int(samples.moves.layer[row]), int(samples.moves.feature[row])
-        self._printed, self._moved = int(printed[-1]) - n, int(moved[-1]) - n
-        self._at = path[:, -1:].copy()
+        if printed >= 0:
+            layer, feature = marks[:, samples.row[printed]].tolist()
+            self._of = layer, feature
+        self._printed, self._moved = printed - n, moved - n
+        self._at = path[:, -1].copy()
         self._added += n
 
     def answered(self, path_mm: Array, answer_mm: Array) -> None:
         """Add the next responses, shapes (2, n) and (channels, 2, n), to samples added before."""
         upto = self._answered + path_mm.shape[1]
         if self._exact is not None:
-            self._choose(np.hypot(*(answer_mm[self._exact] - path_mm)), self._exact)
+            self._choose(path_mm, answer_mm[self._exact], self._exact)
         end = int(np.searchsorted(self._index, upto))
         at = self._index[self._fed : end] - self._answered
         self._answered, self._fed = upto, end
         self._note(self._errors.push(path_mm, answer_mm, at))
 
-    def _choose(self, tracking_mm: Array, channel: int) -> None:
+    def _choose(self, path_mm: Array, answer_mm: Array, channel: int) -> None:
         """Add samples whose error may exceed their feature's maximum so far."""
-        n = len(tracking_mm)
-        (extruding, *of), self._pending = self._pending[:, :n], self._pending[:, n:]
-        chosen = np.zeros(n, np.bool_)
-        for feature in np.unique(of[1][extruding > 0]).tolist():
-            max_mm = self.features[feature][channel] if feature in self.features else 0.0
-            chosen |= (of[1] == feature) & (tracking_mm > max_mm)
-        at = np.flatnonzero(chosen & (extruding > 0))
+        n = path_mm.shape[1]
+        of, self._pending = self._pending[:, :n], self._pending[:, n:]
+        most_mm = np.zeros(max(self.features, default=-1) + 2)
+        for feature, max_mm in self.features.items():
+            most_mm[feature + 1] = max_mm[channel]
+        chosen = np.empty(n, np.int64)
+        at = chosen[: above(path_mm, answer_mm, of[1], most_mm, chosen)]
+        if len(at) == 0:
+            return
         index = np.append(self._index, self._answered + at)
         order = np.argsort(index, kind="stable")
         self._index = index[order]
-        self._groups = np.append(self._groups, np.stack(of)[:, at], axis=1)[:, order]
+        self._groups = np.append(self._groups, of[:, at], axis=1)[:, order]
 
     def finish(self) -> None:
         """Finish: the motion has ended."""
