@@ -245,6 +245,9 @@ class FirmwareAdapter(Protocol):
         0 for a firmware that keeps positions exactly, one step otherwise.
         """
 
+    def stands(self, places_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return where the motors stand when they are sent to places, shapes (n, 3), x y z."""
+
     @property
     def shortest_move_mm(self) -> float:
         """Length in XY below which a move is merged with its neighbours; 0: never."""

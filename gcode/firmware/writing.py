@@ -60,7 +60,7 @@ class StreamWriter:
         self._stream_commands = firmware.stream_commands()
         self._lines = LineReader(self._stream_commands)
         self._extruder_alone_stops = firmware.extruder_alone_stops
-        self._step_mm = firmware.step_mm
+        self._stands = firmware.stands
         self._limits_now: Limits | None = None
         """The planner's limits while streaming."""
         self._stamp = stamp
@@ -395,7 +395,7 @@ class StreamWriter:
             own = self._stream_commands.in_stream(own)
         text = self._stream_commands.limits(own)
         text += self._file_modes(replace(piece.modal_before, absolute_xyz=True, absolute_e=False))
-        return text + jump_lines(piece, self._step_mm)
+        return text + jump_lines(piece, self._stands)
 
     def _off(self, verbatim: VerbatimPart, extruder_mm: float) -> bytes:
         """Return lines that restore the file's state."""

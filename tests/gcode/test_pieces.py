@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -12,6 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stillpath.gcode.errors import GcodeError
+from stillpath.gcode.firmware.jumps import jump_lines
+from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.pieces import Piece, VerbatimPart
 from stillpath.gcode.plan import plan_moves
@@ -140,6 +143,40 @@ def test_what_may_not_come_after_a_jump_stays(machine: Machine, jump: str) -> No
     pieces = [item for item in items if isinstance(item, Piece)]
     assert pieces[-1].text == b"G1 X20 E1\nG1 Y40 E1\n"
     assert not pieces[-1].after_mark
+
+
+@pytest.mark.parametrize("toward", ["X100 Y80.5", "X79.5 Y60", "X80 Y60"])
+@pytest.mark.parametrize(
+    ("firmware", "kinematics", "steps_per_mm"),
+    [
+        ("marlin", "corexy", 80.0),
+        ("reprapfirmware", "cartesian", 160.0),
+        ("reprapfirmware", "corexy", 160.0),
+    ],
+)
+def test_no_motor_steps_where_a_jump_is_caught(
+    firmware: str, kinematics: str, steps_per_mm: float, toward: str
+) -> None:
+    """Wherever the head stands at three decimals: close to half a step of either motor, too."""
+    machine = ender3_with(firmware).model_copy(update={"kinematics": kinematics})
+    piece = [
+        item
+        for item in cut(f"{HEAD}{EXCLUDED[0]}\nG1 {toward}\nG1 X20 E1\n".encode(), machine)
+        if isinstance(item, Piece)
+    ][-1]
+    axes = kinematics == "cartesian" or firmware == "marlin"
+    motors = np.eye(2) if axes else np.array([[1.0, 1.0], [1.0, -1.0]])
+    made = 0
+    for x, y in np.random.default_rng(5).integers(50000, 90000, (500, 2)) / 1000:
+        begin = np.array([[x, y, 0.2, 0.0]])
+        moves = replace(piece.moves, start_mm=np.vstack([begin, piece.moves.start_mm[1:]]))
+        lines = jump_lines(replace(piece, moves=moves), adapter(machine).stands).decode()
+        places = np.array([[float(w[1:]) for w in one.split()[1:3]] for one in lines.splitlines()])
+        np.testing.assert_allclose(places[1], (x, y), atol=1e-9)
+        assert np.hypot(*(places[0] - places[1])) == pytest.approx(1e-3)
+        assert len(set(map(tuple, np.rint(places @ motors * steps_per_mm).tolist()))) == 1
+        made += abs(places[0] - (x, y))[0] > 0.0
+    assert 0 < made < 500
 
 
 @pytest.mark.parametrize(

@@ -55,6 +55,10 @@ class KlipperAdapter:
             "leaves all moves as they are and sets the firmware's own shaper."
         )
 
+    def stands(self, places_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the places: moves between them are exact, whatever the motors round."""
+        return places_mm
+
     def initial_limits(self) -> KlipperLimits:
         """Limits of printer.cfg."""
         planner = self._firmware.planner

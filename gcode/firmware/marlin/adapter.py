@@ -116,6 +116,11 @@ class MarlinAdapter:
             )
         return None
 
+    def stands(self, places_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the places in whole steps of the axes, also on a CoreXY (Marlin's planner.cpp)."""
+        step_mm = np.array(self.step_mm[:3])
+        return np.asarray(np.rint(places_mm / step_mm) * step_mm)
+
     def initial_limits(self) -> MarlinLimits:
         """Limits at power-on."""
         return initial_limits(self._firmware)

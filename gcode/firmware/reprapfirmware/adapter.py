@@ -14,7 +14,7 @@ from stillpath.gcode.firmware.base import scaled
 from stillpath.gcode.firmware.reprapfirmware.advice import RepRapAdviser
 from stillpath.gcode.firmware.reprapfirmware.encoder import STEEPEST, RepRapEncoder, stream_limits
 from stillpath.gcode.firmware.reprapfirmware.limits import RepRapLimits
-from stillpath.gcode.firmware.reprapfirmware.planner import RepRapPlanner
+from stillpath.gcode.firmware.reprapfirmware.planner import RepRapPlanner, on_steps
 from stillpath.gcode.firmware.reprapfirmware.stream_commands import RepRapStreamCommands
 from stillpath.gcode.types import Limits
 from stillpath.models.firmware import RepRapFirmware
@@ -59,6 +59,10 @@ class RepRapAdapter:
             f"stream up to {STEEPEST_MESH:g}: tram the bed, or use method advise, which leaves "
             "all moves as they are and sets shaper and accelerations"
         )
+
+    def stands(self, places_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the places in whole steps of the motors."""
+        return on_steps(places_mm, self._firmware, self._machine.kinematics)
 
     def initial_limits(self) -> RepRapLimits:
         """Limits of config.g."""
