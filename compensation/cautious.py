@@ -117,5 +117,5 @@ class CautiousFbf:
     def _better(
         self, one: Array, other: Array, y_d_mm: Array, extruding: NDArray[np.bool_]
     ) -> bool:
-        errors = [self._inner.contour_square(y_d_mm, u, extruding) for u in (one, other)]
-        return errors[0] <= errors[1]
+        error_mm2 = self._inner.contour_square(y_d_mm, one, extruding)
+        return error_mm2 <= self._inner.contour_square(y_d_mm, other, extruding, error_mm2)

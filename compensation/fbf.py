@@ -274,11 +274,16 @@ class PreviewFbf:
         return frozenset().union(*(axis.windows_outside(bounds, row) for row, bounds in asked))
 
     def contour_square(
-        self, y_d_mm: Array, command_mm: Array, extruding: NDArray[np.bool_]
+        self,
+        y_d_mm: Array,
+        command_mm: Array,
+        extruding: NDArray[np.bool_],
+        enough_mm2: float = np.inf,
     ) -> float:
         """Return the mean squared contour error [mm2] of a piece's command from a path (2, n).
 
-        The mean is over the design's plants, paired between X and Y, and over extruding motion.
+        The mean is over the design's plants, paired between X and Y, and over extruding motion. It
+        may be too small if it is above `enough_mm2`: the plants that are left are not asked.
         """
         count = max(axis.members for axis in self._axes)
         reach = round(_REACH_S / self._dt_s)
@@ -287,6 +292,8 @@ class PreviewFbf:
             rows = zip(self._axes, command_mm, strict=True)
             y = np.stack([axis.answer(j % axis.members, row) for axis, row in rows])
             total += contour_square(y_d_mm, y, extruding, reach, _STRIDE)
+            if total > count * enough_mm2:
+                break
         return total / count
 
     def accel_limits_mm_s2(self, y_d_mm: Array) -> tuple[float, float]:
