@@ -84,7 +84,8 @@ class Result:
     """One table of one benchmark.
 
     `show` names, for some columns, the values of the rows that the page shows. `code` is the
-    commit, or what is known of it. `order` is the place within `section`.
+    commit, or what is known of it. `order` is the place within `section`. `means` and
+    `falls_short` are paragraphs; in a file a single one may be a string.
     """
 
     title: str
@@ -97,9 +98,9 @@ class Result:
     code: str
     columns: tuple[Column, ...]
     rows: tuple[tuple[Cell, ...], ...]
-    means: str
+    means: tuple[str, ...]
     show: dict[str, list[Cell]] = field(default_factory=dict)
-    falls_short: str = ""
+    falls_short: tuple[str, ...] = ()
     name: str = ""
 
     def column(self, head: str) -> int:
@@ -127,6 +128,9 @@ def read(path: Path) -> Result:
         )
     if data["section"] not in SECTIONS:
         raise ValueError(f"{path.name}: section {data['section']!r} is none of {SECTIONS}")
+    for key in ("means", "falls_short"):
+        text = data.get(key, [])
+        data[key] = (text,) if isinstance(text, str) else tuple(text)
     data["columns"] = tuple(Column(**column) for column in data["columns"])
     data["rows"] = tuple(tuple(row) for row in data["rows"])
     for number, row in enumerate(data["rows"], 1):
@@ -157,12 +161,15 @@ def described(result: Result) -> str:
     """Return one result as it stands on the page."""
     rows = result.shown()
     code = "" if result.code.startswith(result.date) else f", code {result.code}"
-    asked = f"{result.asks} `{result.command}` ({result.date}{code})."
+    ran = f"`{result.command}` ({result.date}{code})."
     if len(rows) < len(result.rows):
-        asked += f" {len(rows)} of {len(result.rows)} rows, from `results/{result.name}.json`:"
-    parts = [f"### {result.title}", asked, table(result.columns, rows), result.means]
-    if result.falls_short:
-        parts[-1] += f" **Falls short:** {result.falls_short}"
+        ran += f" {len(rows)} of {len(result.rows)} rows, from `results/{result.name}.json`:"
+    parts = [f"### {result.title}", result.asks, ran, table(result.columns, rows), *result.means]
+    if len(result.falls_short) == 1:
+        parts.append(f"**Falls short.** {result.falls_short[0]}")
+    elif result.falls_short:
+        parts.append("**Falls short.**")
+        parts.append("\n".join(f"- {text}" for text in result.falls_short))
     return "\n\n".join(parts)
 
 
