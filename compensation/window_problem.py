@@ -165,8 +165,8 @@ def within_bounds(
     Parameters
     ----------
     tied : Tied
-        Its solution without bounds. In the coordinates w = L' c, normal = L L', the cost is
-        |w - wish|^2: well conditioned even where a rest leaves few samples.
+        Its solution without bounds, which exceeds them. In the coordinates w = L' c, normal = L L',
+        the cost is |w - wish|^2: well conditioned even where a rest leaves few samples.
     z : ndarray, shape (nz,)
         Member states and the last two commands.
     path_mm : ndarray, shape (window,)
@@ -177,14 +177,15 @@ def within_bounds(
     command, rows, low, high = tied.command, tied.pinned, tied.values, tied.values
     last, previous = float(z[-2]), float(z[-1])
     taken = np.zeros((3, len(path_mm)), bool)
-    while not bounds.kept(Extremes.of(command, last, previous)):
+    table, one = bounds.table(), np.eye(len(tied.wish))
+    while True:
         # Add constraints where the command exceeds its bounds, and repeat for the new command.
         more = constraints_at(
             command,
             tied.fixed,
             last,
             previous,
-            bounds.table(),
+            table,
             tied.factor,
             functions.summed,
             tied.moving,
@@ -192,11 +193,10 @@ def within_bounds(
             taken,
         )
         if len(more[0]) == 0:
-            break
+            return command
         rows, low, high = map(np.concatenate, zip((rows, low, high), more, strict=True))
         kinds = np.zeros(len(rows), np.int32)
         kinds[: len(tied.values)] = _EQUAL
-        one = np.eye(len(tied.wish))
         found, _, flag, _ = daqp.solve(one, -tied.wish, rows, high, low, kinds)
         if flag <= 0:
             # Infeasible; the caller notices and uses a gentler design.
@@ -204,4 +204,5 @@ def within_bounds(
         command = command_of(
             tied.factor, found, functions.basis, tied.moving, last, previous, path_mm
         )
-    return command
+        if bounds.kept(Extremes.of(command, last, previous)):
+            return command
