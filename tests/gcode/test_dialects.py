@@ -352,7 +352,7 @@ CLASSES = {
         "klipper": EventKind.HARMLESS,
     },
     "M204.2 K0.5": {"bambu": EventKind.UNKNOWN},
-    "M900 K0": {"marlin": EventKind.HARMLESS},  # as it is already
+    "M900 K0": {"marlin": EventKind.LIMITS},  # as it is already: no stop
     "M495 X F10 T100": {"marlin": EventKind.HARMLESS},  # set, not begun
     "M496": {"marlin": EventKind.HARMLESS},
     "M900 K0.05 T1": {"marlin": EventKind.HARMLESS},
