@@ -174,6 +174,9 @@ class StreamCommands(Protocol):
         PAUSE macros may read the mark; a firmware without macros returns them as they are.
         """
 
+    def unmarks(self, line: bytes) -> bool:
+        """Return whether a line of the file that sets limits removes that mark."""
+
 
 class Adviser(Protocol):
     """Commands for the firmware's own shaper and the acceleration of printing moves.

@@ -29,6 +29,7 @@ from stillpath.gcode.firmware.line_reader import (
     STANDS,
     LineReader,
 )
+from stillpath.gcode.firmware.marking import marked_text
 from stillpath.gcode.firmware.modes import WrittenModes, written_modes
 from stillpath.gcode.firmware.planning import stops
 from stillpath.gcode.pieces import LeftOut, Piece, VerbatimPart
@@ -156,7 +157,8 @@ class StreamWriter:
             self._file_shapers.note(line, int(events.line[row]))
         if len(moves) or np.any(stops(events)):
             self._at_rest = self._rests(verbatim, at_end=True)
-        return lead + verbatim.text
+        keep_mark = self._marked is not None
+        return lead + (marked_text(verbatim, self._stream_commands) if keep_mark else verbatim.text)
 
     def piece(self, piece: Piece, encoded: Encoded, extruder_mm: float) -> bytes:
         """Return the text of a compensated piece; `extruder_mm` as in `verbatim`."""
@@ -404,7 +406,7 @@ class StreamWriter:
             return self._unmarked() + shaper
         stop = b"" if self._at_rest or self._rests(verbatim) else self._stream_commands.stand_still
         limits = verbatim.limits_before
-        if self._shaper_off and self._shaper_is_known:
+        if self._shaper_off:
             self._marked, limits = limits, self._stream_commands.in_stream(limits)
         line_note = b", line %d of the original" % verbatim.first_line
         text = stop + self._stream_off(limits, verbatim.modal_before, extruder_mm, line_note)
@@ -465,17 +467,18 @@ class StreamWriter:
         return self._advance_on(verbatim.limits_before) if prints else b""
 
     def _advance_on(self, limits: Limits) -> bytes:
-        if not self._shaper_off or not self._shaper_is_known or self._advances:
+        if not self._shaper_off or self._advances:
             return b""
         lines = self._stream_commands.advance_aside(limits)
         self._advances = bool(lines)
         return lines
 
-    @property
-    def _shaper_is_known(self) -> bool:
-        return self._stream_commands.shaper_on is not None or bool(self._file_shapers.lines)
-
     def _shaper_on(self, limits: Limits) -> bytes:
+        """Return lines that set the shaper again, as far as it is known.
+
+        What is not stays off; but what follows, as a pause, may set it, and the next stream
+        switches it off again.
+        """
         if not self._shaper_off:
             return b""
         self._shaper_off = self._advances = False
@@ -483,9 +486,6 @@ class StreamWriter:
         if stated is None:
             set_again = [self._stream_commands.shaped_axes(line) for line in said]
             self._left_off |= {"X", "Y"}.difference(*set_again)
-        if not self._shaper_is_known:
-            self._shaper_off = True
-            return b""
         lines = (stated or b"") + b"".join(said)
         advance = self._stream_commands.advance(limits)
         return lines if lines.endswith(advance) else lines + advance

@@ -197,7 +197,8 @@ def test_the_shaper_is_not_switched_for_travel(pipeline: Pipeline, machine: Mach
     shaper = FirmwareShaper(type_x="ei(0.05)", freq_x_hz=51.5, type_y="mzv", freq_y_hz=39)
     firmware = machine.firmware.model_copy(update={"shaper": shaper})
     known = machine.model_copy(update={"firmware": firmware, "pressure_advance_s": 0.05})
-    marks = "EXCLUDE_OBJECT_END NAME=a\nEXCLUDE_OBJECT_START NAME=a\nG1 X130 Y90 F9000\n"
+    corner = "SET_VELOCITY_LIMIT SQUARE_CORNER_VELOCITY=5\n"  # as Orca writes for each feature
+    marks = f"EXCLUDE_OBJECT_END NAME=a\n{corner}EXCLUDE_OBJECT_START NAME=a\nG1 X130 Y90 F9000\n"
     text = HEAD + ROUND + 5 * (marks + ROUND) + "G28\n"
     written = pipeline(text, known)
     assert differences(text.encode(), written, known) == []
@@ -209,6 +210,7 @@ def test_the_shaper_is_not_switched_for_travel(pipeline: Pipeline, machine: Mach
         rb"SQUARE_CORNER_VELOCITY=(\S+) [^\n]*\n[^\n]*\n.*stream off, line [^\n]*\nEXCLUDE", written
     )
     assert limits == 5 * [b"5.0000005"]
+    assert len(re.findall(b"%bSET_[^\n]*=5.0000005 " % corner.encode(), written)) == 5
     assert written.rindex(b"SQUARE_CORNER_VELOCITY=5 ") < written.rindex(b"SET_INPUT_SHAPER")
     # Off and on: each stands for the times ahead before and after it. With advance those are 20 ms
     # each; without, the shaper's longer side where it is on, and a millisecond where it is off.
@@ -225,6 +227,19 @@ def test_the_shaper_is_not_switched_for_travel(pipeline: Pipeline, machine: Mach
     )
     assert 0.0 < result.left_alone_s < 0.2 * result.time_s
     assert result.left_alone_extruding_s == 0.0
+
+
+def test_a_shaper_that_nobody_states_is_switched_off_again_after_a_pause(
+    pipeline: Pipeline,
+) -> None:
+    """PAUSE of stillpath.cfg, or a macro for another tool, may have set it meanwhile."""
+    written = pipeline(HEAD + ROUND + "PAUSE\n" + 2 * (ROUND + "G4 P5\n"))
+    assert written.count(b"SET_INPUT_SHAPER SHAPER_FREQ_X=0") == 2
+    corners = re.findall(
+        rb"CORNER_VELOCITY=(5\S*) [^\n]*\n[^\n]*\n.*stream off[^\n]*\n(\S+)", written
+    )
+    rest, pause = (b"5.0000005", b"G4"), (b"5", b"PAUSE")
+    assert corners == [rest, pause, rest, rest]  # a pause sent at rest must find the mark
 
 
 def test_shaper_of_the_file_is_restored(pipeline: Pipeline) -> None:

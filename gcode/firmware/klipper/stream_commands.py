@@ -97,3 +97,7 @@ class KlipperStreamCommands:
         # The mark is the seventh decimal.
         corner = round(own.square_corner_velocity_mm_s, 6) + IN_STREAM_MARK_MM_S
         return replace(own, square_corner_velocity_mm_s=corner)
+
+    def unmarks(self, line: bytes) -> bool:
+        """Return whether a line sets the corner velocity, which holds the mark."""
+        return b"SQUARE_CORNER_VELOCITY" in line.split(b";", 1)[0].upper()

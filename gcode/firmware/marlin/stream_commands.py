@@ -152,6 +152,10 @@ class MarlinStreamCommands:
         """
         return without_advance(cast(MarlinLimits, limits))
 
+    def unmarks(self, line: bytes) -> bool:  # noqa: ARG002
+        """Return False: there is no mark."""
+        return False
+
 
 def _number(value: float) -> str:
     """Ten digits without an exponent, at which Marlin stops reading."""

@@ -107,6 +107,10 @@ class RepRapStreamCommands:
         """Return the file's own limits."""
         return limits
 
+    def unmarks(self, line: bytes) -> bool:  # noqa: ARG002
+        """Return False: there is no mark."""
+        return False
+
 
 def _advance(seconds: float) -> bytes:
     return f"M572 S{_number(seconds)}\n".encode()
