@@ -162,6 +162,8 @@ class Dialect:
         found = self.words.get(name)
         if found is None and name[:1] == "T" and (len(name) == 1 or name[1] in "-0123456789"):
             found = self.words.get("T")
+        elif name[:1] == "@":
+            found = self.words.get("@")
         return self.otherwise(name) if found is None else found
 
     def table(self, letter: str) -> NDArray[np.int8]:

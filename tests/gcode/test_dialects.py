@@ -380,6 +380,9 @@ CLASSES = {
         line: {"reprapfirmware": EventKind.STOP}
         for line in ("M17", "M906 X800", "M913 X50", "G17", "M302 P1", "M92 X80")
     },
+    # OctoPrint's, and its plugins'.
+    **{line: dict.fromkeys(ALL, EventKind.UNKNOWN) for line in ("@pause", "N5 @OCTOLAPSE TAKE")},
+    "@Objectinfo a X1 Y2": dict.fromkeys(ALL, EventKind.HARMLESS),
     "M107": {"reprapfirmware": EventKind.HARMLESS},
     "M600": {"marlin": EventKind.UNKNOWN, "reprapfirmware": EventKind.UNKNOWN},
     "M500": {"marlin": EventKind.UNKNOWN, "reprapfirmware": EventKind.HARMLESS},

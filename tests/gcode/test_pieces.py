@@ -102,6 +102,7 @@ MARKS_OF_ALL = [
     ("; printing object a id:0 copy 0", "; printing object b id:0 copy 0"),
     (";MESH:a", ";MESH:b"),
     (";PRINTING: a", ";PRINTING: b"),
+    ("@Object a id:0 copy 0", "@Object b id:0 copy 0"),  # OctoPrint's Cancel Objects
     ("M486 S0\n; printing object a", "M486 S-1\n; stop printing object a\nM486 S1"),
 ]
 
@@ -115,7 +116,7 @@ MARKS_OF_ALL = [
 )
 def test_object_marks(firmware: str, a: str, b: str) -> None:
     """A mark ends a piece, and the next one begins behind it; the same object's does not."""
-    again = f"{a}\n" if a.startswith(";") else ""
+    again = f"{a}\n" if a.startswith((";", "@")) else ""
     jump = "G1 X20 Y20 F9000\nG1 E1\n"
     drawn = f"G1 X40 Y20 E1\n{again}G1 X40 Y40 E1\n"
     text = HEAD + (f"{b}\n" if again else "")

@@ -13,7 +13,14 @@ from __future__ import annotations
 
 import re
 
-from stillpath.gcode.commands import NO_ARCS, NO_RETRACTION, cancel_object, home, retract
+from stillpath.gcode.commands import (
+    NO_ARCS,
+    NO_RETRACTION,
+    cancel_object,
+    home,
+    host_command,
+    retract,
+)
 from stillpath.gcode.dialect import NEEDED, Action, Dialect, Word, words
 from stillpath.gcode.firmware.klipper import commands, flushing
 from stillpath.gcode.types import EventKind
@@ -48,6 +55,7 @@ PYTHON_WORDS: dict[str, Word] = {
     "M204": commands.acceleration,
     "M486": cancel_object,
     "T": commands.tool,
+    "@": host_command,
     "ACTIVATE_EXTRUDER": commands.activate_extruder,
     "SET_VELOCITY_LIMIT": commands.velocity_limit,
     "SET_GCODE_OFFSET": commands.gcode_offset,

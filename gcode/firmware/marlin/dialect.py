@@ -10,7 +10,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from stillpath.gcode.commands import NO_ARCS, NO_RETRACTION, cancel_object, home, retract, tool
+from stillpath.gcode.commands import (
+    NO_ARCS,
+    NO_RETRACTION,
+    cancel_object,
+    home,
+    host_command,
+    retract,
+    tool,
+)
 from stillpath.gcode.dialect import (
     Action,
     ArcRule,
@@ -48,6 +56,7 @@ MOTION: dict[str, Word] = {
     "M221": commands.extrude_factor,
     "M486": cancel_object,
     "T": tool,
+    "@": host_command,
 }
 
 ARCS: dict[str, Word] = {

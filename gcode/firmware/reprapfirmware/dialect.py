@@ -5,7 +5,7 @@ Sources: docs/dialects.md, which also says what was not read in the firmware's o
 
 from __future__ import annotations
 
-from stillpath.gcode.commands import NO_ARCS, cancel_object, home, retract
+from stillpath.gcode.commands import NO_ARCS, cancel_object, home, host_command, retract
 from stillpath.gcode.dialect import (
     Action,
     ArcRule,
@@ -51,6 +51,7 @@ MOTION: dict[str, Word] = {
     "M453": commands.machine_mode,
     "M486": cancel_object,
     "T": commands.tool,
+    "@": host_command,
 }
 
 ARCS: dict[str, Word] = {
