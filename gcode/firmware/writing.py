@@ -99,12 +99,14 @@ class StreamWriter:
                 "not add up: in compensated stretches it is off, around them as the file sets it."
             )
 
-    def leading(self, piece: Piece) -> bytes:
-        """Return lines that take time before a piece's stream, often none.
+    def leading(self, piece: Piece, extruder_mm: float) -> bytes:
+        """Return lines that take time before a piece's stream, often none; as in `piece`.
 
         They switch the shaper off. After an object's mark they are all before the stream.
         """
-        return copy.copy(self)._lead(piece) if piece.after_mark else self._switching_off
+        return (
+            copy.copy(self)._lead(piece, extruder_mm) if piece.after_mark else self._switching_off
+        )
 
     @property
     def _switching_off(self) -> bytes:
@@ -157,14 +159,13 @@ class StreamWriter:
             self._file_shapers.note(line, int(events.line[row]))
         if len(moves) or np.any(stops(events)):
             self._at_rest = self._rests(verbatim, at_end=True)
-        keep_mark = self._marked is not None
-        return lead + (marked_text(verbatim, self._stream_commands) if keep_mark else verbatim.text)
+        return lead + marked_text(verbatim, self._stream_commands, self._marked)
 
     def piece(self, piece: Piece, encoded: Encoded, extruder_mm: float) -> bytes:
         """Return the text of a compensated piece; `extruder_mm` as in `verbatim`."""
         self._reads(extruder_mm)
         limits, level = encoded.limits, encoded.level
-        parts = [self._on(piece, limits[level[0]])]
+        parts = [self._on(piece, limits[level[0]], extruder_mm)]
         rows, events = encoded.row, piece.events
         index = self._event_places(piece, encoded)
         modes = written_modes(piece, index)
@@ -363,14 +364,14 @@ class StreamWriter:
         self._modal = replace(now, absolute_xyz=state.absolute_xyz, absolute_e=state.absolute_e)
         return text
 
-    def _on(self, piece: Piece, limits: Limits) -> bytes:
+    def _on(self, piece: Piece, limits: Limits, extruder_mm: float) -> bytes:
         """Return the lines before the first segment of a piece."""
         if self._streaming:
-            return self._lead(piece)
+            return self._lead(piece, extruder_mm)
         self._limits_now = limits
-        return self._lead(piece) + self._stream_commands.limits(limits)
+        return self._lead(piece, extruder_mm) + self._stream_commands.limits(limits)
 
-    def _lead(self, piece: Piece) -> bytes:
+    def _lead(self, piece: Piece, extruder_mm: float) -> bytes:
         """Return those of them that still move under the file's limits, or stand."""
         parts: list[bytes] = []
         if not (self._at_rest or piece.after_mark):
@@ -380,7 +381,7 @@ class StreamWriter:
         if not self._streaming:
             parts.append(b"; stillpath: stream on\n")
             if piece.after_mark:
-                parts.append(self._jump(piece))
+                parts.append(self._jump(piece, extruder_mm))
             parts.append(self._switching_off)
             if piece.after_mark:
                 # Klipper waits longer if it has to stand before it switches its shaper off.
@@ -390,14 +391,14 @@ class StreamWriter:
             self._streaming = True
         return b"".join(parts)
 
-    def _jump(self, piece: Piece) -> bytes:
+    def _jump(self, piece: Piece, extruder_mm: float) -> bytes:
         """Return lines to where a piece begins, behind an object's mark."""
         own = piece.limits_before
         if self._shaper_off:
             own = self._stream_commands.in_stream(own)
         text = self._stream_commands.limits(own)
         text += self._file_modes(replace(piece.modal_before, absolute_xyz=True, absolute_e=False))
-        return text + jump_lines(piece, self._step_mm)
+        return text + jump_lines(piece, self._step_mm, extruder_mm)
 
     def _off(self, verbatim: VerbatimPart, extruder_mm: float) -> bytes:
         """Return lines that restore the file's state."""
@@ -476,8 +477,7 @@ class StreamWriter:
     def _shaper_on(self, limits: Limits) -> bytes:
         """Return lines that set the shaper again, as far as it is known.
 
-        What is not stays off; but what follows, as a pause, may set it, and the next stream
-        switches it off again.
+        The next stream switches it off in any case: a pause or a macro may have set it.
         """
         if not self._shaper_off:
             return b""

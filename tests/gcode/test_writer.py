@@ -366,6 +366,43 @@ def test_filament_adds_up(pipeline: Pipeline, machine: Machine) -> None:
     np.testing.assert_allclose(ends[1], ends[0], atol=1e-5)
 
 
+def cancelling(lines: list[bytes], name: bytes, *, after: int) -> list[bytes]:
+    """What OctoPrint's Cancel Objects sends: of an object no line, then the E that it has read."""
+    sent, skips, ended, tracks, e, seen, active = [], False, False, False, b"0", 0, b""
+    for line in lines:
+        if found := re.match(rb"@Object (\S+)", line):
+            active = found[1]
+            skips, ended = skips and active == name, skips and active != name
+        if line.startswith((b"@", b";")):
+            continue
+        seen += active == name
+        skips = skips or (active == name and seen > after)
+        tracks = line == b"M82" or (tracks and line != b"M83")
+        if ended and tracks:
+            sent.append(b"G92 E" + e)
+        ended = False
+        if not skips:
+            sent.append(line)
+        elif tracks and (found := re.match(rb"G[01] .*E([\d.]+)", line)):
+            e = found[1]
+    return sent
+
+
+@pytest.mark.parametrize("after", [0, 60])
+def test_an_object_that_octoprint_skips_leaves_absolute_filament_right(
+    pipeline: Pipeline, machine: Machine, after: int
+) -> None:
+    """From its beginning, or from the middle of a stream on, in a file that is a metre in."""
+    figure = "@Object {0}\nG1 X{1} Y{1} F6000\nG1 E{2} F2400\nG1 X{3} E{4} F3600\nG1 Y{3} E{5}\n"
+    text = "@Object z\n" + HEAD.replace("M83", "M82\nG92 E1000")
+    text += figure.format("a", 80, 1001, 100, 1002, 1003)
+    text += figure.format("b", 120, 1004, 150, 1005, 1006) + "G28 X\n"
+    lines = pipeline(text).splitlines()
+    sent = b"\n".join(cancelling(lines, b"a", after=after)) + b"\n"
+    moves = [b.moves for b in Interpreter(machine).push(sent)]
+    assert max(np.abs(m.end_mm - m.start_mm)[:, 3].max() for m in moves if len(m)) <= 1.001
+
+
 @pytest.mark.parametrize("height", ["", "G1 Z.3\n"])
 def test_a_height_that_the_file_leaves_alone_is_not_named(pipeline: Pipeline, height: str) -> None:
     """Off the grid, or unknown after a start macro: naming it would drive the nozzle there."""
