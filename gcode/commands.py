@@ -97,7 +97,8 @@ def retract(state: MachineState, command: Command) -> int:
 
 def cancel_object(state: MachineState, command: Command) -> int:
     """M486: S opens an object, S-1 closes it."""
-    if "S" in command.words:
+    letters = "".join(command.words)
+    if "S" in letters.split("A", 1)[0]:  # behind A is a name
         number = command.words["S"]
         closing = number.startswith("-") or not number
         state.settle()

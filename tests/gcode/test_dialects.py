@@ -487,6 +487,19 @@ def test_a_retraction_that_a_printer_lacks_is_told(read, name: str) -> None:
     assert read("G10 P1 S200\n", name, retraction=None)[1].warnings == []
 
 
+def test_temperatures_of_a_tool_move_nothing(read) -> None:
+    """RepRapFirmware's G10 P, also where the machine does not say how bare ones retract."""
+    block, _ = read("G10 P1 S200\nG10\n", "reprapfirmware", retraction=None)
+    assert block.events.kind.tolist() == [EventKind.HARMLESS, EventKind.UNKNOWN]
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_the_name_of_an_object_ends_none(read, name: str) -> None:
+    """PrusaSlicer writes M486 A and the name; that of a MeshShape holds an S."""
+    block, _ = read("M486 S3\nM486 AMeshShape id:0\nG1 X1 F600\nM486 S-1\nG1 X2\n", name)
+    assert block.moves.object_id.tolist() == [0, -1]
+
+
 def test_a_macro_of_that_name_is_the_users(read) -> None:
     macros = {"arcs": False, "retraction": None, "stopping_macros": ("G2", "G10")}
     assert read("G2 X9 I2\nG10\n", "klipper", **macros)[1].warnings == []

@@ -30,6 +30,7 @@ MOTION: dict[str, Word] = {
     "G0": Action.MOVE,
     "G1": Action.MOVE,
     "G4": Action.DWELL,
+    "G10": commands.retract_or_offsets,
     "G20": Action.INCHES,
     "G21": Action.MILLIMETRES,
     "G28": home,
@@ -61,7 +62,6 @@ ARCS: dict[str, Word] = {
 }
 
 RETRACTION: dict[str, Word] = {
-    "G10": commands.retract_or_offsets,
     **words("G11 M101 M103", retract),
     "M207": commands.retract_settings,
 }
