@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware._writing_kernels import format_moves
-from stillpath.gcode.firmware.base import FirmwareAdapter
+from stillpath.gcode.firmware.base import FirmwareAdapter, changed_limits
 from stillpath.gcode.firmware.encoding import Encoded, to_units
 from stillpath.gcode.firmware.file_shapers import FileShapers
 from stillpath.gcode.firmware.jumps import jump_lines
@@ -309,9 +309,7 @@ class StreamWriter:
         if limits == self._limits_now:
             return b""
         before, self._limits_now = self._limits_now, limits
-        known = b"" if before is None else self._stream_commands.limits(before)
-        lines = self._stream_commands.limits(limits).splitlines(keepends=True)
-        return b"".join(line for line in lines if line not in known.splitlines(keepends=True))
+        return changed_limits(self._stream_commands, before, limits)
 
     def _enter_stream_state(self, limits: Limits, modes: ModalState) -> bytes:
         """Return lines that set the stream's limits and modes."""

@@ -31,6 +31,7 @@ class KlipperStreamCommands:
         "CANCEL_PRINT must restore the limits first: see stillpath.cfg.",
     )
     stand_still = b"G4 P0 ; stand still\n"
+    fence = b""
     positioning_sets_extruder = False
     folds_case = True
     coarse_extruder = False

@@ -38,6 +38,7 @@ class MarlinStreamCommands:
     """
 
     stand_still = b"M400 ; stand still\n"
+    fence = b""
     positioning_sets_extruder = True
     coarse_extruder = True
     one_command = True

@@ -40,6 +40,7 @@ class RepRapStreamCommands:
         "must put your own values back first: see Stillpath's docs/safety.md.",
     )
     stand_still = b"M400\n"
+    fence = f"{_FENCE}\n".encode()
     positioning_sets_extruder = False
     folds_case = True
     coarse_extruder = False
