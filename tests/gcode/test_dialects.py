@@ -19,7 +19,11 @@ from stillpath.models.machine import Machine
 HOMED = {"homed_at_start": True, "home_mm": (0.0, 0.0, 0.0)}
 BUILD = {
     **dict.fromkeys(
-        ("inch_mode", "cnc_planes", "cnc_workspaces", "bezier_curves", "saved_positions"), True
+        (
+            *("inch_mode", "cnc_planes", "cnc_workspaces", "bezier_curves", "saved_positions"),
+            "arc_circles",
+        ),
+        True,
     ),
     **HOMED,
 }
@@ -225,6 +229,14 @@ def test_where_it_ends(case: str, name: str, read) -> None:
 def test_refused(line: str, name: str, words: str, read) -> None:
     with pytest.raises(GcodeError, match=words):
         read(line + "\n", name)
+
+
+@pytest.mark.parametrize(("name", "circles"), [("marlin-stock", 1), ("marlin", 2), ("klipper", 1)])
+def test_p_of_an_arc_is_for_builds_that_have_it(read, name: str, circles: int) -> None:
+    """OrcaSlicer writes G3 with P1 for a lift of one turn, for every firmware."""
+    block, _ = read("G1 X10 F600\nG3 Z.4 I-5 J0 P1\n", name)
+    way = np.diff(block.moves.end_mm[:, :2], axis=0)
+    assert np.hypot(*way.T).sum() == pytest.approx(circles * 10 * math.pi, rel=2e-2)
 
 
 @pytest.mark.parametrize("line", ["G1 X5 F600\r\r", "\rG1 X5 F600", "G1 X5 F600 ; a\rb"])

@@ -206,6 +206,7 @@ def marlin(firmware: Marlin) -> Dialect:
         longest_command=firmware.max_cmd_size - 1,
         cut_long_commands=True,
         extruder=ExtruderRule.FOLLOWS_AXES,
+        arc_circles=firmware.arc_circles,
         arc=ArcRule.MARLIN_2_0 if firmware.variant == "2.0" else ArcRule.MARLIN_2_1,
         dwell=DwellRule.S_OR_P,
         origin=OriginRule.OFFSET,
