@@ -495,6 +495,7 @@ def test_what_a_printer_lacks_is_told(read, name: str) -> None:
 def test_a_retraction_that_a_printer_lacks_is_told(read, name: str) -> None:
     _, interpreter = read("G1 X5 F600\nG10\nG1 X9\nG11\n", name, retraction=None)
     assert [said[:12] for said in interpreter.warnings] == ["line 2: G10:", "line 4: G11:"]
+    assert read("G17\n", name, arcs=False)[0].events.kind[0] <= EventKind.MODE
     # With words it sets temperatures of tools, a macro where there is one.
     assert read("G10 P1 S200\n", name, retraction=None)[1].warnings == []
 
