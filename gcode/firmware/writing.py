@@ -30,7 +30,7 @@ from stillpath.gcode.firmware.line_reader import (
     LineReader,
 )
 from stillpath.gcode.firmware.marking import marked_text
-from stillpath.gcode.firmware.modes import WrittenModes, written_modes
+from stillpath.gcode.firmware.modes import WrittenModes, feed_line, written_modes
 from stillpath.gcode.firmware.planning import stops
 from stillpath.gcode.pieces import LeftOut, Piece, VerbatimPart
 from stillpath.gcode.types import EventKind, Limits, ModalState
@@ -302,7 +302,7 @@ class StreamWriter:
         if moves_on and not FEED.search(code):
             alone = self._stream_commands.factors_need_axes and not AXES.search(code)
             factor = 1.0 if alone else state.speed_factor
-            lead += _feed_line(float(moves.speed_mm_s[row]) * 60.0 / factor)
+            lead += feed_line(float(moves.speed_mm_s[row]) * 60.0 / factor)
         return lead + line
 
     def _limits_to(self, limits: Limits) -> bytes:
@@ -400,13 +400,15 @@ class StreamWriter:
 
     def _off(self, verbatim: VerbatimPart, extruder_mm: float) -> bytes:
         """Return lines that restore the file's state."""
-        shaper = self._shaper_before(verbatim)
-        if not self._streaming:
-            return self._unmarked() + shaper
-        stop = b"" if self._at_rest or self._rests(verbatim) else self._stream_commands.stand_still
-        limits = verbatim.limits_before
-        if self._shaper_off:
+        shaper, limits = self._shaper_before(verbatim), verbatim.limits_before
+        known = self._stream_commands.shaper_on is not None or self._file_shapers.lines
+        begins = self._shaper_off and self._marked is None
+        if begins and (known or isinstance(verbatim, LeftOut)):
             self._marked, limits = limits, self._stream_commands.in_stream(limits)
+        if not self._streaming:
+            marking = limits is not verbatim.limits_before
+            return (self._stream_commands.limits(limits) if marking else self._unmarked()) + shaper
+        stop = b"" if self._at_rest or self._rests(verbatim) else self._stream_commands.stand_still
         line_note = b", line %d of the original" % verbatim.first_line
         text = stop + self._stream_off(limits, verbatim.modal_before, extruder_mm, line_note)
         return text + shaper
@@ -448,7 +450,7 @@ class StreamWriter:
         text += self._file_extruder(extruder_mm + self._zero_mm)
         self._modal = None
         mark = b"; stillpath: stream off" + line_note + b"\n"
-        return text + _feed_line(self._file_feed_mm_min) + mark
+        return text + feed_line(self._file_feed_mm_min) + mark
 
     def _shaper_before(self, verbatim: VerbatimPart) -> bytes:
         """Set the firmware's shaper again before lines that print on their own.
@@ -491,8 +493,3 @@ class StreamWriter:
 
 def _held_back(line: bytes) -> bytes:
     return b"; stillpath, held back: " + line
-
-
-def _feed_line(feedrate_mm_min: float) -> bytes:
-    digits = f"{feedrate_mm_min:.5f}".rstrip("0").rstrip(".")
-    return f"G1 F{digits}\n".encode()

@@ -233,13 +233,22 @@ def test_a_shaper_that_nobody_states_is_switched_off_again_after_a_pause(
     pipeline: Pipeline,
 ) -> None:
     """PAUSE of stillpath.cfg, or a macro for another tool, may have set it meanwhile."""
-    written = pipeline(HEAD + ROUND + "PAUSE\n" + 2 * (ROUND + "G4 P5\n"))
+    written = pipeline(HEAD + ROUND + "PAUSE\n" + ROUND)
     assert written.count(b"SET_INPUT_SHAPER SHAPER_FREQ_X=0") == 2
-    corners = re.findall(
-        rb"CORNER_VELOCITY=(5\S*) [^\n]*\n[^\n]*\n.*stream off[^\n]*\n(\S+)", written
-    )
-    rest, pause = (b"5.0000005", b"G4"), (b"5", b"PAUSE")
-    assert corners == [rest, pause, rest, rest]  # a pause sent at rest must find the mark
+
+
+def test_what_stays_as_sliced_says_that_the_shaper_is_off(
+    tmp_path: Path, cache: Path, machine: Machine
+) -> None:
+    """Else a RESUME in it would leave the shaper on, below the next stream."""
+    corner = "SET_VELOCITY_LIMIT SQUARE_CORNER_VELOCITY={}\n"
+    turns = "\n".join(polygon(8, 15)) + "\n"
+    infill = f"G4 P1\n;TYPE:Internal infill\nG1 X115 Y100\n{turns}{corner.format(8)}{turns}"
+    text = f"{HEAD};TYPE:External perimeter\n{corner.format(9)}{ROUND}{infill}"
+    text += f";TYPE:External perimeter\n{ROUND}G28\n"
+    _, written = compensated(text, tmp_path, cache, machine, where="visible")
+    assert re.search(rb"infill\nSET_[^\n]*=9\.0000005 [^\n]*\nG1 X115 Y100\n", written)
+    assert re.search(rb"\n%bSET_[^\n]*=8\.0000005 " % corner.format(8).encode(), written)
 
 
 def test_shaper_of_the_file_is_restored(pipeline: Pipeline) -> None:
