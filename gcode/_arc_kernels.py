@@ -37,6 +37,7 @@ from stillpath.gcode._slots import (
     F_UNIT_MM,
     FULL,
     I_ABS_XYZ,
+    I_ARC_CIRCLES,
     I_ARC_RULE,
     I_MOVES,
     I_NEED,
@@ -209,7 +210,7 @@ def arc(
     # A full turn back, rounded, is none either.
     nothing = (nothing or (rule == _MARLIN_2_1 and angle == 0.0)) and not whole
     turns = 0
-    if mask & (1 << _P) and _MARLIN_2_0 <= rule <= _MARLIN_2_1 and not nothing:
+    if mask & (1 << _P) and i[I_ARC_CIRCLES] and not nothing:
         turns = int(max(0.0, min(w[_P], 65535.0)))
         if turns > _MOST_CIRCLES:
             f[F_ERROR] = turns

@@ -78,6 +78,7 @@ I_ODD_WORDS = 43  # bit per letter: a move with that word is Python's
 I_HOLD = 44  # every command is Python's: it may not be carried out at all
 I_APART = 45  # not every move of the rows starts where the one before it ends
 I_OBJECTS = 46  # objects that were named so far
+I_ARC_CIRCLES = 47  # P of an arc adds circles
 I_SIZE = 48
 
 # Rows of the integer columns: of moves (M_) and of events (E_), each sort of number by itself.

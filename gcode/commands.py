@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import re
+
 from stillpath.gcode import _slots as at
+from stillpath.gcode.comments import note_object
 from stillpath.gcode.dialect import Word
 from stillpath.gcode.lexer import Command
 from stillpath.gcode.state import MachineState
 from stillpath.gcode.types import EventKind
 
-__all__ = ["NO_ARCS", "NO_RETRACTION", "cancel_object", "home", "retract", "tool"]
+__all__ = ["NO_ARCS", "NO_RETRACTION", "cancel_object", "home", "host_command", "retract", "tool"]
+
+_OBJECT = re.compile(r"\s*@object(info|stop)?\b([^;]*)", re.IGNORECASE)
+"""Marks that the plugin Cancel Objects puts in place of slicers' comments."""
 
 
 def home(state: MachineState, command: Command) -> int:
@@ -91,12 +97,24 @@ def retract(state: MachineState, command: Command) -> int:
 
 def cancel_object(state: MachineState, command: Command) -> int:
     """M486: S opens an object, S-1 closes it."""
-    if "S" in command.words:
+    letters = "".join(command.words)
+    if "S" in letters.split("A", 1)[0]:  # behind A is a name
         number = command.words["S"]
         closing = number.startswith("-") or not number
         state.settle()
         state.i[at.I_OBJECT] = -1 if closing else state.objects.number(number)
     return state.event(EventKind.OBJECT)
+
+
+def host_command(state: MachineState, command: Command) -> int:
+    """@ and a word: OctoPrint pauses, or a plugin of it moves the head or excludes an object."""
+    found = _OBJECT.match(command.text)
+    if found is None:
+        state.macro_ran = True
+        return state.event(EventKind.UNKNOWN)
+    if found[1] is not None and found[1].lower() == "info":
+        return state.event(EventKind.HARMLESS)
+    return note_object(state, command, "" if found[1] else found[2].strip())
 
 
 def tool(state: MachineState, command: Command) -> int:

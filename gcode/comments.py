@@ -10,7 +10,7 @@ from stillpath.gcode.slicers.marks import MarkKind, read_mark
 from stillpath.gcode.state import MachineState
 from stillpath.gcode.types import KEPT, EventKind
 
-__all__ = ["note_comment"]
+__all__ = ["note_comment", "note_object"]
 
 
 def note_comment(state: MachineState, command: Command) -> int:
@@ -38,17 +38,25 @@ def note_comment(state: MachineState, command: Command) -> int:
         i[at.I_FEATURE] = number
         state.remember(command, at.MEMO_FEATURE, number + 1)
     elif kind == MarkKind.OBJECT:
-        # Moonraker, OctoPrint's plugin and RepRapFirmware exclude objects by these comments, too.
-        # A single object is cancelled with the print.
-        number, before = state.objects.number(mark.text), int(i[at.I_OBJECT])
-        state.settle()
-        i[at.I_OBJECT], i[at.I_OBJECTS] = number, len(state.objects.names)
-        state.remember(command, at.MEMO_OBJECT, number + 1)
-        changed = number != before and i[at.I_OBJECTS] > 1
-        return state.event(EventKind.OBJECT if changed else EventKind.HARMLESS)
+        return note_object(state, command, mark.text)
     else:
         state.remember(command, at.MEMO_EVENT, int(EventKind.HARMLESS))
     return state.event(EventKind.HARMLESS)
+
+
+def note_object(state: MachineState, command: Command, name: str) -> int:
+    """Begin another object, or none, at a mark by which hosts exclude.
+
+    Moonraker, OctoPrint's plugin and RepRapFirmware go by comments. A single object is cancelled
+    with the print.
+    """
+    i = state.i
+    number, before = state.objects.number(name), int(i[at.I_OBJECT])
+    state.settle()
+    i[at.I_OBJECT], i[at.I_OBJECTS] = number, len(state.objects.names)
+    state.remember(command, at.MEMO_OBJECT, number + 1)
+    changed = number != before and i[at.I_OBJECTS] > 1
+    return state.event(EventKind.OBJECT if changed else EventKind.HARMLESS)
 
 
 def _note_layer(state: MachineState, command: Command, style: str, height: str) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillpath.gcode._slots import (
+    I_ARC_CIRCLES,
     I_ARC_RULE,
     I_AXES_FACTORS,
     I_DWELL_RULE,
@@ -128,6 +129,8 @@ class Dialect:
     # What commands do
     extruder: ExtruderRule = ExtruderRule.WITH_AXES
     arc: ArcRule = ArcRule.KLIPPER
+    arc_circles: bool = False
+    """P of G2 and G3 adds circles (Marlin)."""
     dwell: DwellRule = DwellRule.P_ONLY
     origin: OriginRule = OriginRule.BARE_IS_ZERO
     factor_default: bool = True
@@ -162,6 +165,8 @@ class Dialect:
         found = self.words.get(name)
         if found is None and name[:1] == "T" and (len(name) == 1 or name[1] in "-0123456789"):
             found = self.words.get("T")
+        elif name[:1] == "@":
+            found = self.words.get("@")
         return self.otherwise(name) if found is None else found
 
     def table(self, letter: str) -> NDArray[np.int8]:
@@ -185,6 +190,7 @@ class Dialect:
         """Write the rules that the kernel follows into its state."""
         i[I_E_RULE] = self.extruder
         i[I_ARC_RULE] = self.arc
+        i[I_ARC_CIRCLES] = self.arc_circles
         i[I_DWELL_RULE] = self.dwell
         i[I_ORIGIN_RULE] = self.origin
         i[I_ZERO_FEED] = self.zero_feed_passes

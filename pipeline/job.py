@@ -335,7 +335,7 @@ class Job:
 
         This precedes the compensation of the piece: vibration dies down meanwhile.
         """
-        lines = self._writer.leading(piece)
+        lines = self._writer.leading(piece, self._checker.extruder_mm)
         blocks = self._checker.snapshot().push(lines) if lines else []
         seconds = switching_s(blocks)
         seconds += sum(flowing_s(self._previous, b, self._machine) for b in blocks if len(b.moves))
@@ -355,8 +355,9 @@ class Job:
             with self._clock.stage("compensate"):
                 made = self._work.compensate(paced, self._point)
             with self._clock.stage("write"):
-                lead = self._writer.leading(piece) if piece.after_mark else b""
-                text = self._writer.piece(piece, made.encoded, self._checker.extruder_mm)
+                extruder_mm = self._checker.extruder_mm
+                lead = self._writer.leading(piece, extruder_mm) if piece.after_mark else b""
+                text = self._writer.piece(piece, made.encoded, extruder_mm)
             with self._clock.stage("read back"):
                 checker = self._checker.snapshot()
                 self._checker.push(lead)

@@ -30,6 +30,7 @@ __all__ = [
     "FirmwareAdapter",
     "Planner",
     "StreamCommands",
+    "changed_limits",
     "corner_step_mm_s",
     "scaled",
     "square_corner_mm_s",
@@ -108,6 +109,10 @@ class StreamCommands(Protocol):
         """A line that waits for the end of motion and changes nothing."""
 
     @property
+    def fence(self) -> bytes:
+        """The line of `limits` that waits until the move before has been planned; empty: none."""
+
+    @property
     def positioning_sets_extruder(self) -> bool:
         """G90 and G91 set the extruder's mode as well (Marlin)."""
 
@@ -173,6 +178,9 @@ class StreamCommands(Protocol):
 
         PAUSE macros may read the mark; a firmware without macros returns them as they are.
         """
+
+    def unmarks(self, line: bytes) -> bool:
+        """Return whether a line of the file that sets limits removes that mark."""
 
 
 class Adviser(Protocol):
@@ -310,6 +318,13 @@ class FirmwareAdapter(Protocol):
         travel_mm : ndarray, shape (n, 4)
             x y z e; moves that do not climb in the file may still climb along a bed mesh.
         """
+
+
+def changed_limits(commands: StreamCommands, before: Limits | None, after: Limits) -> bytes:
+    """Return the lines that set limits, less those that say what is in force already."""
+    known = [] if before is None else commands.limits(before).splitlines(keepends=True)
+    lines = commands.limits(after).splitlines(keepends=True)
+    return b"".join(line for line in lines if line == commands.fence or line not in known)
 
 
 def corner_step_mm_s(command: CommandLimits) -> float:

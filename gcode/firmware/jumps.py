@@ -16,17 +16,26 @@ _ASIDE_UNITS = 1000
 """1 um."""
 
 
-def jump_lines(piece: Piece, stands: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> bytes:
+def jump_lines(
+    piece: Piece,
+    stands: Callable[[NDArray[np.float64]], NDArray[np.float64]],
+    extruder_mm: float,
+) -> bytes:
     """Return two moves that end where a piece begins, for absolute X and Y.
 
     A firmware that skipped the object before stands elsewhere, and gets here by the first move of X
     or Y. That must not be one of a stream, under the stream's limits. Where nothing was skipped,
     these moves go aside by a micrometre and back; on whole steps, no motor makes one.
 
+    OctoPrint's Cancel Objects sends no line of an object, and then a G92 E by the absolute E that
+    it has read; but a stream has relative E. So the E of a file with absolute E is set again.
+
     Parameters
     ----------
     stands : callable
         `FirmwareAdapter.stands`.
+    extruder_mm : float
+        The file's E where the piece begins.
     """
     begin, end = (to_units(at[0, :3]) for at in (piece.moves.start_mm, piece.moves.end_mm))
     aside = _aside(begin, end, stands)
@@ -34,7 +43,8 @@ def jump_lines(piece: Piece, stands: Callable[[NDArray[np.float64]], NDArray[np.
     origin = to_units(np.array(state.origin_mm[:2]))
     feed_mm_min = float(piece.moves.speed_mm_s[0]) * 60.0 / state.speed_factor
     places = ((at[:2] - origin) / UNITS_PER_MM for at in (aside, begin))
-    return b"".join(b"G1 X%.6f Y%.6f F%.3f\n" % (x, y, feed_mm_min) for x, y in places)
+    extruder = b"G92 E%.7f\n" % extruder_mm if state.absolute_e else b""
+    return extruder + b"".join(b"G1 X%.6f Y%.6f F%.3f\n" % (x, y, feed_mm_min) for x, y in places)
 
 
 def _aside(

@@ -1,4 +1,4 @@
-"""Modal states of a piece's written moves."""
+"""Modal states of a piece's written moves, and the line that sets F."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from stillpath.gcode.pieces import Piece
 from stillpath.gcode.types import EventKind, ModalState
 
-__all__ = ["WrittenModes", "written_modes"]
+__all__ = ["WrittenModes", "feed_line", "written_modes"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,3 +42,9 @@ def written_modes(piece: Piece, index: NDArray[np.int64]) -> WrittenModes:
         if keep
     ]
     return WrittenModes(first[last], ours)
+
+
+def feed_line(feedrate_mm_min: float) -> bytes:
+    """Return the line that sets F alone."""
+    digits = f"{feedrate_mm_min:.5f}".rstrip("0").rstrip(".")
+    return f"G1 F{digits}\n".encode()

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware._writing_kernels import format_moves
-from stillpath.gcode.firmware.base import FirmwareAdapter
+from stillpath.gcode.firmware.base import FirmwareAdapter, changed_limits
 from stillpath.gcode.firmware.encoding import Encoded, to_units
 from stillpath.gcode.firmware.file_shapers import FileShapers
 from stillpath.gcode.firmware.jumps import jump_lines
@@ -29,7 +29,8 @@ from stillpath.gcode.firmware.line_reader import (
     STANDS,
     LineReader,
 )
-from stillpath.gcode.firmware.modes import WrittenModes, written_modes
+from stillpath.gcode.firmware.marking import marked_text
+from stillpath.gcode.firmware.modes import WrittenModes, feed_line, written_modes
 from stillpath.gcode.firmware.planning import stops
 from stillpath.gcode.pieces import LeftOut, Piece, VerbatimPart
 from stillpath.gcode.types import EventKind, Limits, ModalState
@@ -98,12 +99,14 @@ class StreamWriter:
                 "not add up: in compensated stretches it is off, around them as the file sets it."
             )
 
-    def leading(self, piece: Piece) -> bytes:
-        """Return lines that take time before a piece's stream, often none.
+    def leading(self, piece: Piece, extruder_mm: float) -> bytes:
+        """Return lines that take time before a piece's stream, often none; as in `piece`.
 
         They switch the shaper off. After an object's mark they are all before the stream.
         """
-        return copy.copy(self)._lead(piece) if piece.after_mark else self._switching_off
+        return (
+            copy.copy(self)._lead(piece, extruder_mm) if piece.after_mark else self._switching_off
+        )
 
     @property
     def _switching_off(self) -> bytes:
@@ -156,13 +159,13 @@ class StreamWriter:
             self._file_shapers.note(line, int(events.line[row]))
         if len(moves) or np.any(stops(events)):
             self._at_rest = self._rests(verbatim, at_end=True)
-        return lead + verbatim.text
+        return lead + marked_text(verbatim, self._stream_commands, self._marked)
 
     def piece(self, piece: Piece, encoded: Encoded, extruder_mm: float) -> bytes:
         """Return the text of a compensated piece; `extruder_mm` as in `verbatim`."""
         self._reads(extruder_mm)
         limits, level = encoded.limits, encoded.level
-        parts = [self._on(piece, limits[level[0]])]
+        parts = [self._on(piece, limits[level[0]], extruder_mm)]
         rows, events = encoded.row, piece.events
         index = self._event_places(piece, encoded)
         modes = written_modes(piece, index)
@@ -299,16 +302,14 @@ class StreamWriter:
         if moves_on and not FEED.search(code):
             alone = self._stream_commands.factors_need_axes and not AXES.search(code)
             factor = 1.0 if alone else state.speed_factor
-            lead += _feed_line(float(moves.speed_mm_s[row]) * 60.0 / factor)
+            lead += feed_line(float(moves.speed_mm_s[row]) * 60.0 / factor)
         return lead + line
 
     def _limits_to(self, limits: Limits) -> bytes:
         if limits == self._limits_now:
             return b""
         before, self._limits_now = self._limits_now, limits
-        known = b"" if before is None else self._stream_commands.limits(before)
-        lines = self._stream_commands.limits(limits).splitlines(keepends=True)
-        return b"".join(line for line in lines if line not in known.splitlines(keepends=True))
+        return changed_limits(self._stream_commands, before, limits)
 
     def _enter_stream_state(self, limits: Limits, modes: ModalState) -> bytes:
         """Return lines that set the stream's limits and modes."""
@@ -361,14 +362,14 @@ class StreamWriter:
         self._modal = replace(now, absolute_xyz=state.absolute_xyz, absolute_e=state.absolute_e)
         return text
 
-    def _on(self, piece: Piece, limits: Limits) -> bytes:
+    def _on(self, piece: Piece, limits: Limits, extruder_mm: float) -> bytes:
         """Return the lines before the first segment of a piece."""
         if self._streaming:
-            return self._lead(piece)
+            return self._lead(piece, extruder_mm)
         self._limits_now = limits
-        return self._lead(piece) + self._stream_commands.limits(limits)
+        return self._lead(piece, extruder_mm) + self._stream_commands.limits(limits)
 
-    def _lead(self, piece: Piece) -> bytes:
+    def _lead(self, piece: Piece, extruder_mm: float) -> bytes:
         """Return those of them that still move under the file's limits, or stand."""
         parts: list[bytes] = []
         if not (self._at_rest or piece.after_mark):
@@ -378,7 +379,7 @@ class StreamWriter:
         if not self._streaming:
             parts.append(b"; stillpath: stream on\n")
             if piece.after_mark:
-                parts.append(self._jump(piece))
+                parts.append(self._jump(piece, extruder_mm))
             parts.append(self._switching_off)
             if piece.after_mark:
                 # Klipper waits longer if it has to stand before it switches its shaper off.
@@ -388,24 +389,26 @@ class StreamWriter:
             self._streaming = True
         return b"".join(parts)
 
-    def _jump(self, piece: Piece) -> bytes:
+    def _jump(self, piece: Piece, extruder_mm: float) -> bytes:
         """Return lines to where a piece begins, behind an object's mark."""
         own = piece.limits_before
         if self._shaper_off:
             own = self._stream_commands.in_stream(own)
         text = self._stream_commands.limits(own)
         text += self._file_modes(replace(piece.modal_before, absolute_xyz=True, absolute_e=False))
-        return text + jump_lines(piece, self._stands)
+        return text + jump_lines(piece, self._stands, extruder_mm)
 
     def _off(self, verbatim: VerbatimPart, extruder_mm: float) -> bytes:
         """Return lines that restore the file's state."""
-        shaper = self._shaper_before(verbatim)
-        if not self._streaming:
-            return self._unmarked() + shaper
-        stop = b"" if self._at_rest or self._rests(verbatim) else self._stream_commands.stand_still
-        limits = verbatim.limits_before
-        if self._shaper_off and self._shaper_is_known:
+        shaper, limits = self._shaper_before(verbatim), verbatim.limits_before
+        known = self._stream_commands.shaper_on is not None or self._file_shapers.lines
+        begins = self._shaper_off and self._marked is None
+        if begins and (known or isinstance(verbatim, LeftOut)):
             self._marked, limits = limits, self._stream_commands.in_stream(limits)
+        if not self._streaming:
+            marking = limits is not verbatim.limits_before
+            return (self._stream_commands.limits(limits) if marking else self._unmarked()) + shaper
+        stop = b"" if self._at_rest or self._rests(verbatim) else self._stream_commands.stand_still
         line_note = b", line %d of the original" % verbatim.first_line
         text = stop + self._stream_off(limits, verbatim.modal_before, extruder_mm, line_note)
         return text + shaper
@@ -447,7 +450,7 @@ class StreamWriter:
         text += self._file_extruder(extruder_mm + self._zero_mm)
         self._modal = None
         mark = b"; stillpath: stream off" + line_note + b"\n"
-        return text + _feed_line(self._file_feed_mm_min) + mark
+        return text + feed_line(self._file_feed_mm_min) + mark
 
     def _shaper_before(self, verbatim: VerbatimPart) -> bytes:
         """Set the firmware's shaper again before lines that print on their own.
@@ -465,17 +468,17 @@ class StreamWriter:
         return self._advance_on(verbatim.limits_before) if prints else b""
 
     def _advance_on(self, limits: Limits) -> bytes:
-        if not self._shaper_off or not self._shaper_is_known or self._advances:
+        if not self._shaper_off or self._advances:
             return b""
         lines = self._stream_commands.advance_aside(limits)
         self._advances = bool(lines)
         return lines
 
-    @property
-    def _shaper_is_known(self) -> bool:
-        return self._stream_commands.shaper_on is not None or bool(self._file_shapers.lines)
-
     def _shaper_on(self, limits: Limits) -> bytes:
+        """Return lines that set the shaper again, as far as it is known.
+
+        The next stream switches it off in any case: a pause or a macro may have set it.
+        """
         if not self._shaper_off:
             return b""
         self._shaper_off = self._advances = False
@@ -483,9 +486,6 @@ class StreamWriter:
         if stated is None:
             set_again = [self._stream_commands.shaped_axes(line) for line in said]
             self._left_off |= {"X", "Y"}.difference(*set_again)
-        if not self._shaper_is_known:
-            self._shaper_off = True
-            return b""
         lines = (stated or b"") + b"".join(said)
         advance = self._stream_commands.advance(limits)
         return lines if lines.endswith(advance) else lines + advance
@@ -493,8 +493,3 @@ class StreamWriter:
 
 def _held_back(line: bytes) -> bytes:
     return b"; stillpath, held back: " + line
-
-
-def _feed_line(feedrate_mm_min: float) -> bytes:
-    digits = f"{feedrate_mm_min:.5f}".rstrip("0").rstrip(".")
-    return f"G1 F{digits}\n".encode()

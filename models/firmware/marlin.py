@@ -119,6 +119,8 @@ class Marlin(FirmwareFacts):
     """MIN_ARC_SEGMENT_MM; the longest segment is `arc_resolution_mm` (MAX_ARC_SEGMENT_MM)."""
     min_circle_segments: Annotated[int, Field(ge=1)] = 72
     """MIN_CIRCLE_SEGMENTS."""
+    arc_circles: bool = False
+    """ARC_P_CIRCLES: P of G2 and G3 adds circles. Others pass it over, as Orca's P1 in lifts."""
     inch_mode: bool = False
     """INCH_MODE_SUPPORT: G20."""
     cnc_planes: bool = False

@@ -36,7 +36,10 @@ _COMMAND = re.compile(rb"^(?!\xef\xbb\xbf)[^\S\n]*[^;\s]", re.MULTILINE)
 _VALUE = re.compile(rb"(?<=[A-Z=])\s*[-+]?[.\d]+")
 _OURS = AxisShaper("ours")
 _HEEDED = np.array(
-    [EventKind.LIMITS, EventKind.STOP, EventKind.UNKNOWN, EventKind.OBJECT, EventKind.SHAPER]
+    [
+        *(EventKind.LIMITS, EventKind.STOP, EventKind.UNKNOWN, EventKind.OBJECT),
+        *(EventKind.SHAPER, EventKind.STATE),
+    ]
 )
 
 

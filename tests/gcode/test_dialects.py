@@ -19,7 +19,11 @@ from stillpath.models.machine import Machine
 HOMED = {"homed_at_start": True, "home_mm": (0.0, 0.0, 0.0)}
 BUILD = {
     **dict.fromkeys(
-        ("inch_mode", "cnc_planes", "cnc_workspaces", "bezier_curves", "saved_positions"), True
+        (
+            *("inch_mode", "cnc_planes", "cnc_workspaces", "bezier_curves", "saved_positions"),
+            "arc_circles",
+        ),
+        True,
     ),
     **HOMED,
 }
@@ -227,6 +231,14 @@ def test_refused(line: str, name: str, words: str, read) -> None:
         read(line + "\n", name)
 
 
+@pytest.mark.parametrize(("name", "circles"), [("marlin-stock", 1), ("marlin", 2), ("klipper", 1)])
+def test_p_of_an_arc_is_for_builds_that_have_it(read, name: str, circles: int) -> None:
+    """OrcaSlicer writes G3 with P1 for a lift of one turn, for every firmware."""
+    block, _ = read("G1 X10 F600\nG3 Z.4 I-5 J0 P1\n", name)
+    way = np.diff(block.moves.end_mm[:, :2], axis=0)
+    assert np.hypot(*way.T).sum() == pytest.approx(circles * 10 * math.pi, rel=2e-2)
+
+
 @pytest.mark.parametrize("line", ["G1 X5 F600\r\r", "\rG1 X5 F600", "G1 X5 F600 ; a\rb"])
 def test_carriage_returns_that_end_no_command(line: str, read) -> None:
     for name in ("klipper", "marlin", "reprapfirmware"):
@@ -352,7 +364,7 @@ CLASSES = {
         "klipper": EventKind.HARMLESS,
     },
     "M204.2 K0.5": {"bambu": EventKind.UNKNOWN},
-    "M900 K0": {"marlin": EventKind.HARMLESS},  # as it is already
+    "M900 K0": {"marlin": EventKind.LIMITS},  # as it is already: no stop
     "M495 X F10 T100": {"marlin": EventKind.HARMLESS},  # set, not begun
     "M496": {"marlin": EventKind.HARMLESS},
     "M900 K0.05 T1": {"marlin": EventKind.HARMLESS},
@@ -380,6 +392,9 @@ CLASSES = {
         line: {"reprapfirmware": EventKind.STOP}
         for line in ("M17", "M906 X800", "M913 X50", "G17", "M302 P1", "M92 X80")
     },
+    # OctoPrint's, and its plugins'.
+    **{line: dict.fromkeys(ALL, EventKind.UNKNOWN) for line in ("@pause", "N5 @OCTOLAPSE TAKE")},
+    "@Objectinfo a X1 Y2": dict.fromkeys(ALL, EventKind.HARMLESS),
     "M107": {"reprapfirmware": EventKind.HARMLESS},
     "M600": {"marlin": EventKind.UNKNOWN, "reprapfirmware": EventKind.UNKNOWN},
     "M500": {"marlin": EventKind.UNKNOWN, "reprapfirmware": EventKind.HARMLESS},
@@ -480,8 +495,22 @@ def test_what_a_printer_lacks_is_told(read, name: str) -> None:
 def test_a_retraction_that_a_printer_lacks_is_told(read, name: str) -> None:
     _, interpreter = read("G1 X5 F600\nG10\nG1 X9\nG11\n", name, retraction=None)
     assert [said[:12] for said in interpreter.warnings] == ["line 2: G10:", "line 4: G11:"]
+    assert read("G17\n", name, arcs=False)[0].events.kind[0] <= EventKind.MODE
     # With words it sets temperatures of tools, a macro where there is one.
     assert read("G10 P1 S200\n", name, retraction=None)[1].warnings == []
+
+
+def test_temperatures_of_a_tool_move_nothing(read) -> None:
+    """RepRapFirmware's G10 P, also where the machine does not say how bare ones retract."""
+    block, _ = read("G10 P1 S200\nG10\n", "reprapfirmware", retraction=None)
+    assert block.events.kind.tolist() == [EventKind.HARMLESS, EventKind.UNKNOWN]
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_the_name_of_an_object_ends_none(read, name: str) -> None:
+    """PrusaSlicer writes M486 A and the name; that of a MeshShape holds an S."""
+    block, _ = read("M486 S3\nM486 AMeshShape id:0\nG1 X1 F600\nM486 S-1\nG1 X2\n", name)
+    assert block.moves.object_id.tolist() == [0, -1]
 
 
 def test_a_macro_of_that_name_is_the_users(read) -> None:

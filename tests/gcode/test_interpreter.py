@@ -284,13 +284,13 @@ def test_macros_that_the_machine_declares(wary_machine: Machine) -> None:
         update={
             "harmless_macros": ("_on_layer",),
             "stopping_macros": ("CLEAN", "M600"),
-            "macros": ("M900", "M106"),  # not Klipper's own commands
+            "macros": ("M900", "M300", "M106"),  # not Klipper's own commands
         }
     )
     machine = wary_machine.model_copy(update={"firmware": firmware})
-    block = run("_ON_LAYER LAYER=1\nCLEAN\nm600\nOTHER\nM900 K5\nM205 X8\nM106\n", machine)
+    block = run("_ON_LAYER LAYER=1\nCLEAN\nm600\nOTHER\nM900 K5\nM300\nM205 X8\nM106\n", machine)
     harmless, stop, unknown = EventKind.HARMLESS, EventKind.STOP, EventKind.UNKNOWN
-    assert kinds(block) == [harmless, stop, stop, unknown, unknown, harmless, harmless]
+    assert kinds(block) == [harmless, stop, stop, *3 * [unknown], harmless, harmless]
 
 
 def test_a_printer_without_macros_still_has_klippers_own_commands(golden_machine: Machine) -> None:

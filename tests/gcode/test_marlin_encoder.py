@@ -234,8 +234,9 @@ def test_a_print_is_compensated_and_its_limits_come_back(tmp_path: Path, cache: 
 def test_linear_advance_is_off_in_the_stream_and_on_again_after_it(
     tmp_path: Path, cache: Path, stated: bool | None
 ) -> None:
-    """Whether the machine says that it has it or only the file does."""
-    original = "M900 K0.05\n" + PRINT
+    """Whether the machine says that it has it or only the file does, and where it repeats K."""
+    half = len(HEAD + "G1 X120 Y100 F6000\n" + "\n".join(polygon(6, 15)[:3])) + 1
+    original = f"M900 K0.05\n{PRINT[:half]}M900 K0.05\n{PRINT[half:]}"
     facts = {"home_mm": (0.0, 0.0, 0.0), "linear_advance": stated}
     machine = with_firmware(FIRMWARE.model_copy(update=facts))
     result, text = compensated(original, tmp_path, cache, machine)
@@ -248,6 +249,7 @@ def test_linear_advance_is_off_in_the_stream_and_on_again_after_it(
     )
     known = [(i, line) for i, line in enumerate(lines) if line.startswith("M900")]
     assert known[0][1] == "M900 K0.05"
+    assert lines.count("; stillpath, held back: M900 K0.05") == 1
     assert {line for i, line in known if on < i < off - 8} == {"M900 K0"}
     assert next(line for i, line in known if i >= off - 8) == "M900 K0.05"
     fed = [Interpreter(machine).push(original.encode()), Interpreter(machine).push(text)]

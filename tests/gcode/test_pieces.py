@@ -105,6 +105,7 @@ MARKS_OF_ALL = [
     ("; printing object a id:0 copy 0", "; printing object b id:0 copy 0"),
     (";MESH:a", ";MESH:b"),
     (";PRINTING: a", ";PRINTING: b"),
+    ("@Object a id:0 copy 0", "@Object b id:0 copy 0"),  # OctoPrint's Cancel Objects
     ("M486 S0\n; printing object a", "M486 S-1\n; stop printing object a\nM486 S1"),
 ]
 
@@ -118,7 +119,7 @@ MARKS_OF_ALL = [
 )
 def test_object_marks(firmware: str, a: str, b: str) -> None:
     """A mark ends a piece, and the next one begins behind it; the same object's does not."""
-    again = f"{a}\n" if a.startswith(";") else ""
+    again = f"{a}\n" if a.startswith((";", "@")) else ""
     jump = "G1 X20 Y20 F9000\nG1 E1\n"
     drawn = f"G1 X40 Y20 E1\n{again}G1 X40 Y40 E1\n"
     text = HEAD + (f"{b}\n" if again else "")
@@ -170,8 +171,9 @@ def test_no_motor_steps_where_a_jump_is_caught(
     for x, y in np.random.default_rng(5).integers(50000, 90000, (500, 2)) / 1000:
         begin = np.array([[x, y, 0.2, 0.0]])
         moves = replace(piece.moves, start_mm=np.vstack([begin, piece.moves.start_mm[1:]]))
-        lines = jump_lines(replace(piece, moves=moves), adapter(machine).stands).decode()
-        places = np.array([[float(w[1:]) for w in one.split()[1:3]] for one in lines.splitlines()])
+        lines = jump_lines(replace(piece, moves=moves), adapter(machine).stands, 0.0)
+        words = [line.split()[1:3] for line in lines.decode().splitlines()]
+        places = np.array([[float(word[1:]) for word in line] for line in words])
         np.testing.assert_allclose(places[1], (x, y), atol=1e-9)
         assert np.hypot(*(places[0] - places[1])) == pytest.approx(1e-3)
         assert len(set(map(tuple, np.rint(places @ motors * steps_per_mm).tolist()))) == 1

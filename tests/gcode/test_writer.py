@@ -197,7 +197,8 @@ def test_the_shaper_is_not_switched_for_travel(pipeline: Pipeline, machine: Mach
     shaper = FirmwareShaper(type_x="ei(0.05)", freq_x_hz=51.5, type_y="mzv", freq_y_hz=39)
     firmware = machine.firmware.model_copy(update={"shaper": shaper})
     known = machine.model_copy(update={"firmware": firmware, "pressure_advance_s": 0.05})
-    marks = "EXCLUDE_OBJECT_END NAME=a\nEXCLUDE_OBJECT_START NAME=a\nG1 X130 Y90 F9000\n"
+    corner = "SET_VELOCITY_LIMIT SQUARE_CORNER_VELOCITY=5\n"  # as Orca writes for each feature
+    marks = f"EXCLUDE_OBJECT_END NAME=a\n{corner}EXCLUDE_OBJECT_START NAME=a\nG1 X130 Y90 F9000\n"
     text = HEAD + ROUND + 5 * (marks + ROUND) + "G28\n"
     written = pipeline(text, known)
     assert differences(text.encode(), written, known) == []
@@ -209,6 +210,7 @@ def test_the_shaper_is_not_switched_for_travel(pipeline: Pipeline, machine: Mach
         rb"SQUARE_CORNER_VELOCITY=(\S+) [^\n]*\n[^\n]*\n.*stream off, line [^\n]*\nEXCLUDE", written
     )
     assert limits == 5 * [b"5.0000005"]
+    assert len(re.findall(b"%bSET_[^\n]*=5.0000005 " % corner.encode(), written)) == 5
     assert written.rindex(b"SQUARE_CORNER_VELOCITY=5 ") < written.rindex(b"SET_INPUT_SHAPER")
     # Off and on: each stands for the times ahead before and after it. With advance those are 20 ms
     # each; without, the shaper's longer side where it is on, and a millisecond where it is off.
@@ -225,6 +227,28 @@ def test_the_shaper_is_not_switched_for_travel(pipeline: Pipeline, machine: Mach
     )
     assert 0.0 < result.left_alone_s < 0.2 * result.time_s
     assert result.left_alone_extruding_s == 0.0
+
+
+def test_a_shaper_that_nobody_states_is_switched_off_again_after_a_pause(
+    pipeline: Pipeline,
+) -> None:
+    """PAUSE of stillpath.cfg, or a macro for another tool, may have set it meanwhile."""
+    written = pipeline(HEAD + ROUND + "PAUSE\n" + ROUND)
+    assert written.count(b"SET_INPUT_SHAPER SHAPER_FREQ_X=0") == 2
+
+
+def test_what_stays_as_sliced_says_that_the_shaper_is_off(
+    tmp_path: Path, cache: Path, machine: Machine
+) -> None:
+    """Else a RESUME in it would leave the shaper on, below the next stream."""
+    corner = "SET_VELOCITY_LIMIT SQUARE_CORNER_VELOCITY={}\n"
+    turns = "\n".join(polygon(8, 15)) + "\n"
+    infill = f"G4 P1\n;TYPE:Internal infill\nG1 X115 Y100\n{turns}{corner.format(8)}{turns}"
+    text = f"{HEAD};TYPE:External perimeter\n{corner.format(9)}{ROUND}{infill}"
+    text += f";TYPE:External perimeter\n{ROUND}G28\n"
+    _, written = compensated(text, tmp_path, cache, machine, where="visible")
+    assert re.search(rb"infill\nSET_[^\n]*=9\.0000005 [^\n]*\nG1 X115 Y100\n", written)
+    assert re.search(rb"\n%bSET_[^\n]*=8\.0000005 " % corner.format(8).encode(), written)
 
 
 def test_shaper_of_the_file_is_restored(pipeline: Pipeline) -> None:
@@ -349,6 +373,43 @@ def test_filament_adds_up(pipeline: Pipeline, machine: Machine) -> None:
         reader.push(data)
         ends.append(reader.position_mm)
     np.testing.assert_allclose(ends[1], ends[0], atol=1e-5)
+
+
+def cancelling(lines: list[bytes], name: bytes, *, after: int) -> list[bytes]:
+    """What OctoPrint's Cancel Objects sends: of an object no line, then the E that it has read."""
+    sent, skips, ended, tracks, e, seen, active = [], False, False, False, b"0", 0, b""
+    for line in lines:
+        if found := re.match(rb"@Object (\S+)", line):
+            active = found[1]
+            skips, ended = skips and active == name, skips and active != name
+        if line.startswith((b"@", b";")):
+            continue
+        seen += active == name
+        skips = skips or (active == name and seen > after)
+        tracks = line == b"M82" or (tracks and line != b"M83")
+        if ended and tracks:
+            sent.append(b"G92 E" + e)
+        ended = False
+        if not skips:
+            sent.append(line)
+        elif tracks and (found := re.match(rb"G[01] .*E([\d.]+)", line)):
+            e = found[1]
+    return sent
+
+
+@pytest.mark.parametrize("after", [0, 60])
+def test_an_object_that_octoprint_skips_leaves_absolute_filament_right(
+    pipeline: Pipeline, machine: Machine, after: int
+) -> None:
+    """From its beginning, or from the middle of a stream on, in a file that is a metre in."""
+    figure = "@Object {0}\nG1 X{1} Y{1} F6000\nG1 E{2} F2400\nG1 X{3} E{4} F3600\nG1 Y{3} E{5}\n"
+    text = "@Object z\n" + HEAD.replace("M83", "M82\nG92 E1000")
+    text += figure.format("a", 80, 1001, 100, 1002, 1003)
+    text += figure.format("b", 120, 1004, 150, 1005, 1006) + "G28 X\n"
+    lines = pipeline(text).splitlines()
+    sent = b"\n".join(cancelling(lines, b"a", after=after)) + b"\n"
+    moves = [b.moves for b in Interpreter(machine).push(sent)]
+    assert max(np.abs(m.end_mm - m.start_mm)[:, 3].max() for m in moves if len(m)) <= 1.001
 
 
 @pytest.mark.parametrize("height", ["", "G1 Z.3\n"])

@@ -243,6 +243,7 @@ def test_lines_with_several_commands() -> None:
         b"M204 P500 M572 D0 S0.05",
         b"M204 P500 M400",
         b"G1 X20 M204 P700",
+        b"M204 P700 M106 S1",
         b"M593 F40 G1 X50",
     ]
     data = head + b"".join(line + b"\nG1 X%d E1\n" % k for k, line in enumerate(lines))

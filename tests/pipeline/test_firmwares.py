@@ -55,6 +55,8 @@ def test_compensated(kind: str, beside_a_rest: bytes, tmp_path: Path, cache: Pat
     if beside_a_rest:  # what a line sets beside its move is the file's own, not a stream's
         lead = written[: written.index(hop + beside_a_rest.split(b"\n")[0])]
         assert lead.rindex(b"stream off") > lead.rindex(b"stream on")
+    if kind == "reprapfirmware":  # limits hold when read, so they wait for the move before them
+        assert written.count(b"\nG1\nM201 X") == written.count(b"\nM201 X") > 2 * result.pieces
     rms = {c.name: c.extruding.contour_rms_um for c in result.channels}
     assert rms["after"] < 0.6 * min(rms["before"], rms["shaper"])
     # Marlin starts each stretch with a slow step: 11 s of print take .06 s longer.

@@ -13,7 +13,14 @@ from __future__ import annotations
 
 import re
 
-from stillpath.gcode.commands import NO_ARCS, NO_RETRACTION, cancel_object, home, retract
+from stillpath.gcode.commands import (
+    NO_ARCS,
+    NO_RETRACTION,
+    cancel_object,
+    home,
+    host_command,
+    retract,
+)
 from stillpath.gcode.dialect import NEEDED, Action, Dialect, Word, words
 from stillpath.gcode.firmware.klipper import commands, flushing
 from stillpath.gcode.types import EventKind
@@ -48,6 +55,7 @@ PYTHON_WORDS: dict[str, Word] = {
     "M204": commands.acceleration,
     "M486": cancel_object,
     "T": commands.tool,
+    "@": host_command,
     "ACTIVATE_EXTRUDER": commands.activate_extruder,
     "SET_VELOCITY_LIMIT": commands.velocity_limit,
     "SET_GCODE_OFFSET": commands.gcode_offset,
@@ -68,8 +76,8 @@ RETRACTION_WORDS: dict[str, Word] = {
 NATIVE: dict[str, Word] = {
     # Read back, messages, displays: the motion does not notice.
     **words(
-        "G21 M20 M23 M27 M73 M104 M105 M106 M107 M110 M114 M115 M117 M118 M140 M141 M155 "
-        "M300 ECHO HELP STATUS RESPOND SET_DISPLAY_TEXT SET_DISPLAY_GROUP GET_POSITION "
+        "G21 M20 M23 M27 M73 M104 M105 M106 M107 M110 M114 M115 M117 M118 M140 "
+        "ECHO HELP STATUS RESPOND SET_DISPLAY_TEXT SET_DISPLAY_GROUP GET_POSITION "
         "GET_RETRACTION QUERY_ADC QUERY_FILAMENT_SENSOR SET_FILAMENT_SENSOR SET_IDLE_TIMEOUT "
         "SET_HEATER_TEMPERATURE TURN_OFF_HEATERS SET_TEMPERATURE_FAN_TARGET SET_FAN_SPEED "
         "SET_PIN SET_LED SET_LED_TEMPLATE SET_PRINT_STATS_INFO "
@@ -103,8 +111,9 @@ NATIVE: dict[str, Word] = {
 
 FOREIGN: dict[str, Word] = words(
     # Words of other firmwares that slicers write into every file.
-    "G26 M3 M4 M5 M17 M72 M74 M75 M76 M77 M80 M81 M92 M108 M113 M126 M127 M142 M145 M149 M150 "
-    "M200 M201 M202 M203 M205 M206 M207 M208 M209 M211 M218 M301 M302 M303 M304 M355 M420 M500 "
+    "G17 G18 G19 G26 M3 M4 M5 M17 M72 M74 M75 M76 M77 M80 M81 M92 M108 M113 M126 M127 M141 M142 "
+    "M145 M149 M150 M155 M200 M201 M202 M203 M205 M206 M207 M208 M209 M211 M218 M300 M301 M302 "
+    "M303 M304 M355 M420 M500 "
     "M501 M502 M503 M556 M557 M558 M566 M569 M571 M572 M573 M574 M579 M581 M582 M584 M587 M593 "
     "M595 M605 M620 M621 M622 M623 M624 M625 M710 M851 M862.1 M862.2 M862.3 M862.4 M862.5 "
     "M862.6 "

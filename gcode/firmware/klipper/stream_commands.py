@@ -31,6 +31,7 @@ class KlipperStreamCommands:
         "CANCEL_PRINT must restore the limits first: see stillpath.cfg.",
     )
     stand_still = b"G4 P0 ; stand still\n"
+    fence = b""
     positioning_sets_extruder = False
     folds_case = True
     coarse_extruder = False
@@ -97,3 +98,7 @@ class KlipperStreamCommands:
         # The mark is the seventh decimal.
         corner = round(own.square_corner_velocity_mm_s, 6) + IN_STREAM_MARK_MM_S
         return replace(own, square_corner_velocity_mm_s=corner)
+
+    def unmarks(self, line: bytes) -> bool:
+        """Return whether a line sets the corner velocity, which holds the mark."""
+        return b"SQUARE_CORNER_VELOCITY" in line.split(b";", 1)[0].upper()

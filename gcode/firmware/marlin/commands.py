@@ -114,7 +114,8 @@ def linear_advance(state: MachineState, command: Command) -> int:
         state.warn(f"M900 K{k:g} is not between 0 and 10, and is ignored")
         return state.event(EventKind.HARMLESS)
     if k == state.limit("linear_advance_k_s"):
-        return state.event(EventKind.HARMLESS)
+        # No stop; but a stream has K off, and there the line would switch it on.
+        return state.event(EventKind.LIMITS)
     return state.set_limits(command, {"linear_advance_k_s": k}, remember=False, kind=EventKind.STOP)
 
 

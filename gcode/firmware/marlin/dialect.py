@@ -10,7 +10,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from stillpath.gcode.commands import NO_ARCS, NO_RETRACTION, cancel_object, home, retract, tool
+from stillpath.gcode.commands import (
+    NO_ARCS,
+    NO_RETRACTION,
+    cancel_object,
+    home,
+    host_command,
+    retract,
+    tool,
+)
 from stillpath.gcode.dialect import (
     Action,
     ArcRule,
@@ -48,6 +56,7 @@ MOTION: dict[str, Word] = {
     "M221": commands.extrude_factor,
     "M486": cancel_object,
     "T": tool,
+    "@": host_command,
 }
 
 ARCS: dict[str, Word] = {
@@ -197,6 +206,7 @@ def marlin(firmware: Marlin) -> Dialect:
         longest_command=firmware.max_cmd_size - 1,
         cut_long_commands=True,
         extruder=ExtruderRule.FOLLOWS_AXES,
+        arc_circles=firmware.arc_circles,
         arc=ArcRule.MARLIN_2_0 if firmware.variant == "2.0" else ArcRule.MARLIN_2_1,
         dwell=DwellRule.S_OR_P,
         origin=OriginRule.OFFSET,

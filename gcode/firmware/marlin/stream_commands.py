@@ -38,6 +38,7 @@ class MarlinStreamCommands:
     """
 
     stand_still = b"M400 ; stand still\n"
+    fence = b""
     positioning_sets_extruder = True
     coarse_extruder = True
     one_command = True
@@ -151,6 +152,10 @@ class MarlinStreamCommands:
         mark.
         """
         return without_advance(cast(MarlinLimits, limits))
+
+    def unmarks(self, line: bytes) -> bool:  # noqa: ARG002
+        """Return False: there is no mark."""
+        return False
 
 
 def _number(value: float) -> str:

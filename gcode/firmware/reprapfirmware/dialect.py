@@ -5,7 +5,7 @@ Sources: docs/dialects.md, which also says what was not read in the firmware's o
 
 from __future__ import annotations
 
-from stillpath.gcode.commands import NO_ARCS, cancel_object, home, retract
+from stillpath.gcode.commands import NO_ARCS, cancel_object, home, host_command, retract
 from stillpath.gcode.dialect import (
     Action,
     ArcRule,
@@ -30,6 +30,7 @@ MOTION: dict[str, Word] = {
     "G0": Action.MOVE,
     "G1": Action.MOVE,
     "G4": Action.DWELL,
+    "G10": commands.retract_or_offsets,
     "G20": Action.INCHES,
     "G21": Action.MILLIMETRES,
     "G28": home,
@@ -51,6 +52,7 @@ MOTION: dict[str, Word] = {
     "M453": commands.machine_mode,
     "M486": cancel_object,
     "T": commands.tool,
+    "@": host_command,
 }
 
 ARCS: dict[str, Word] = {
@@ -60,7 +62,6 @@ ARCS: dict[str, Word] = {
 }
 
 RETRACTION: dict[str, Word] = {
-    "G10": commands.retract_or_offsets,
     **words("G11 M101 M103", retract),
     "M207": commands.retract_settings,
 }

@@ -40,6 +40,7 @@ class RepRapStreamCommands:
         "must put your own values back first: see Stillpath's docs/safety.md.",
     )
     stand_still = b"M400\n"
+    fence = f"{_FENCE}\n".encode()
     positioning_sets_extruder = False
     folds_case = True
     coarse_extruder = False
@@ -106,6 +107,10 @@ class RepRapStreamCommands:
     def in_stream(self, limits: Limits) -> Limits:
         """Return the file's own limits."""
         return limits
+
+    def unmarks(self, line: bytes) -> bool:  # noqa: ARG002
+        """Return False: there is no mark."""
+        return False
 
 
 def _advance(seconds: float) -> bytes:
