@@ -173,6 +173,17 @@ def test_a_machine_like_its_plants_is_confirmed(told: RingReport, log: Path) -> 
         assert found.tested_on == TODAY
 
 
+def test_a_copy_of_a_log_is_no_repeat(
+    told: RingReport, log: Path, ring: Path, machine: Machine
+) -> None:
+    """As a browser names what it downloads again."""
+    copy = log.with_name("adxl345-ring (1).csv")
+    copy.write_bytes(log.read_bytes())
+    twice = verify_ring(ring, [log, copy], machine, today=TODAY)
+    assert twice.axes == told.axes
+    assert twice.notes == [*told.notes, f"{copy.name} is a copy of {log.name}: it counts once."]
+
+
 def test_a_mode_that_moved_is_not_confirmed(ring: Path, machine: Machine, tmp_path: Path) -> None:
     moved = {**TRUE, "x": Chain((43.0, 112.0))}
     report = said_of(tmp_path / "a.csv", ring, machine, recorded(ring, machine, moved).raw_data())
@@ -297,9 +308,13 @@ def test_the_command_remembers(
     args = ["verify", str(ring), str(log), "-m", "mine"]
     assert run([*args, "--no-remember"]) == 0
     assert not store.current("mine").machine.confirmations
-    assert run([*args, "--report", str(tmp_path / "told")]) == 0
-    assert "X confirmed" in capsys.readouterr().out
+    # A report that cannot be written takes the verdict with it neither from the screen nor here.
+    assert run([*args, "--report", str(tmp_path / "mine.json" / "told")]) == 1
+    said = capsys.readouterr()
+    assert "X confirmed" in said.out
+    assert "Not a directory" in said.err
     assert set(store.current("mine").machine.confirmations) == {"x", "y"}
+    assert run([*args, "--report", str(tmp_path / "told")]) == 0
     report = json.loads((tmp_path / "told" / "ring-test.json").read_text())
     assert report["axes"][0]["verdict"] == "confirmed"
     assert np.isfinite(report["axes"][0]["misses"])
