@@ -107,6 +107,26 @@ def logged_lines(machine: Machine, settings: RingSettings) -> list[str]:
     return [*logged, logged[-1].partition("NAME=")[2]]
 
 
+@pytest.mark.parametrize(
+    ("kind", "chip", "words"),
+    [
+        ("klipper", "adxl345 head", r"one word: of a section \[adxl345 head\] it is head"),
+        ("klipper", "head;", "one word"),
+        ("reprapfirmware", "P0", "a number, such as 0"),
+    ],
+)
+def test_a_sensor_that_the_firmware_would_stop_at_is_refused(
+    kind: str, chip: str, words: str, machine: Machine
+) -> None:
+    """`accel_chip: adxl345 head` is what [resonance_tester] has."""
+    if kind != "klipper":
+        section = json.loads((EXAMPLES / f"{kind}.json").read_text())
+        machine = with_firmware(machine, section)
+    for settings in (RingSettings(chip), RingSettings(None, chip)):
+        with pytest.raises(ModelError, match=words):
+            RingTest(machine, settings)
+
+
 def test_logs_have_the_name_of_their_own_test(machine: Machine, told: RingReport) -> None:
     """The log of another test is not there to be taken for this one's."""
     settings = RingSettings()
