@@ -314,6 +314,28 @@ def test_the_longest_name_that_a_file_can_have(tmp_path):
     assert target.read_bytes() == TEXT
 
 
+@pytest.mark.skipif(os.name != "posix", reason="modes of POSIX")
+@pytest.mark.parametrize("platform", ["linux", "darwin"])
+def test_a_file_has_the_mode_of_new_ones(platform, tmp_path, monkeypatch):
+    """The umask is the whole process's: two threads that change it to read it may lose it."""
+    known, private, new = (tmp_path / name for name in ("known", "private", "new"))
+    known.write_bytes(TEXT)
+    usual = known.stat().st_mode & 0o777
+    private.write_bytes(TEXT)
+    private.chmod(0o640)
+    monkeypatch.setattr(sys, "platform", platform)
+    monkeypatch.setattr(os, "umask", lambda _: pytest.fail("changed for all threads"))
+    for target, asked, expected in (
+        (new, None, usual),
+        (private, None, 0o640),
+        (new, 0o600, 0o600),
+    ):
+        with replacing(target, asked) as temporary:
+            temporary.write_bytes(TEXT)
+        assert target.stat().st_mode & 0o777 == expected
+    assert len(list(tmp_path.iterdir())) == 3
+
+
 def test_a_full_disk_is_told_with_its_place(pipeline, source, tmp_path, capsys):
     target = tmp_path / "out.gcode"
 
