@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from stillpath.applications.machines import transfer
 from stillpath.applications.machines.checks import check_before_job, differences
 from stillpath.applications.machines.klipper_config import read_printer_config
 from stillpath.applications.machines.store import MachineStore
@@ -152,6 +153,25 @@ def test_export_and_import(store: MachineStore, tmp_path: Path, capsys):
     assert machines("delete", "mine") == 0
     assert machines("import", history) == 0
     assert store.history("mine") == before
+
+
+def test_another_firmware_loses_no_change_made_meanwhile(
+    store: MachineStore, tmp_path: Path, capsys, monkeypatch
+):
+    store.add_revision("mine", make_machine(), author="anna")
+    file = tmp_path / "firmware.json"
+    file.write_text(make_machine().firmware.model_dump_json())
+    original = transfer.with_firmware_file
+
+    def slowly(*arguments):
+        made = original(*arguments)
+        store.add_revision("mine", make_machine(mesh_slope=0.02), author="bob")
+        return made
+
+    monkeypatch.setattr(transfer, "with_firmware_file", slowly)
+    assert machines("set-firmware", "mine", file) == 2
+    assert "is at revision 2, not 1 any more" in one_line(capsys)
+    assert store.current("mine").author == "bob"
 
 
 def test_what_the_shell_of_windows_writes(store: MachineStore, tmp_path: Path, capsys):
