@@ -320,6 +320,18 @@ def test_typed_in_resonances(store: MachineStore, config: Path):
     assert [(mode.f_hz, mode.zeta) for mode in modes] == [(70.0, 0.1), (55.0, 0.1)]
 
 
+def test_a_smoother_has_a_frequency_of_its_own(store: MachineStore, config: Path):
+    """As in Kalico: there shaper_freq_x says nothing of it."""
+    smooth = CONFIG.replace("type_x: ei", "type_x: smooth_ei\nsmoother_freq_x: 70")
+    config.write_text(smooth.replace("#*# shaper_freq_x = 61.2\n", ""))
+    assert machines("from-config", config, "--name", "mine") == 0
+    machine = store.current("mine").machine
+    assert machine.axes["x"].nominal.modes[0].f_hz == 70.0  # type: ignore[union-attr]
+    shaper = machine.firmware.shaper  # type: ignore[union-attr]
+    assert (shaper.type_x, shaper.freq_x_hz) == ("smooth_ei", 70.0)  # type: ignore[union-attr]
+    assert not differences(machine, read_printer_config(config))
+
+
 @pytest.mark.parametrize("hertz", ["inf", "nan", "1e101", "501"])
 def test_resonances_that_are_none(store: MachineStore, config: Path, capsys, hertz: str):
     assert machines("from-config", config, "--name", "mine", "--fx", hertz) == 2
