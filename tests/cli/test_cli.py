@@ -154,6 +154,7 @@ def test_a_link_is_followed(pipeline, source, tmp_path):
         ("-o {folder} -m ender3", ["folder"]),
         ("-o {folder}/no/out.gcode -m ender3", ["does not exist"]),
         ("-o {out} -m ender3 --report {source}", ["--report"]),
+        ("-o - -m ender3", ["nothing is written to the standard output; name a file"]),
         ("-o {out} -m ender3 --report {out}", ["would be the report's own"]),
         ("-o {folder}/layers.bin -m ender3 --report {folder}", ["would be the report's own"]),
         # Said of several options, it names them, and none that there is not.
