@@ -193,6 +193,8 @@ def check_output(target: Path, *inputs: Path | str | None) -> Path:
     inputs : Path or str or None
         What the command reads, as it was named; no file of these is replaced.
     """
+    if str(target) == "-":
+        raise Refused("nothing is written to the standard output; name a file instead of -")
     if target.is_dir():
         raise Refused(f"{target} is a folder; name the file to write")
     if target.exists() and not target.is_file():

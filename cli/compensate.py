@@ -56,6 +56,7 @@ def compensate(
     if output is not None and target.exists() and target.samefile(source):
         raise Refused(f"{output} is the input; name another file, or use --in-place instead of -o")
     check_folder(report)
+    _check_apart(report, target)
     if server:
         compensate_on_server(
             source, target, machine, options, server=server, key=key, report=report
@@ -121,6 +122,20 @@ def simulate(
     result.warnings.extend(found.warnings)
     _write_report(result, report)
     print_result(result)
+
+
+_OF_REPORT = ("report.html", "report.json", "layers.json", "layers.bin")
+
+
+def _check_apart(report: Path | None, target: Path) -> None:
+    """Refuse a result that the report would be, or lie over."""
+    if report is None:
+        return
+    folder = report.resolve()
+    if target == folder or (target.parent == folder and target.name.lower() in _OF_REPORT):
+        raise Refused(
+            f"{target} would be the report's own; name another file, or folder (--report)"
+        )
 
 
 def _machine(name: str) -> Any:

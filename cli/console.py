@@ -50,11 +50,13 @@ def progress_shown() -> Iterator[Callable[[Progress], None]]:
 
 
 @contextmanager
-def told_after(target: Path, missing: str) -> Iterator[None]:
+def told_after(target: Path | str, missing: str) -> Iterator[None]:
     """Do what comes once the output is in its place: failing, it is a warning on stderr.
 
     Parameters
     ----------
+    target : Path or str
+        The output: a file, or a machine's revision.
     missing : str
         What there is not if it fails, such as "report".
     """

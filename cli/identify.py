@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -209,10 +210,9 @@ def _learn_ripple(
         homing_repeatability_mm=chosen.homing_repeatability,
     )
     machine = learnt.named(target.machine, target.title)
-    made = store(machine, learnt.sources)
+    _print_revision(store(machine, learnt.sources))
     _write(target.output, machine)
     typer.echo(learnt.summary)
-    _print_revision(made)
 
 
 def _identify_plants(
@@ -227,7 +227,7 @@ def _identify_plants(
     from stillpath.applications.identification.archive import Archive
     from stillpath.applications.identification.page import write_identification
     from stillpath.applications.identification.run import identify_files, read_inputs
-    from stillpath.cli.console import progress_shown
+    from stillpath.cli.console import progress_shown, told_after
     from stillpath.cli.identification_tables import print_identification
 
     with progress_shown() as progress:
@@ -241,14 +241,16 @@ def _identify_plants(
             progress=_with_times(progress),
         )
     made = store(found.machine, found.report.sources)
-    if made is not None:
-        # Where the service looks for them.
-        Archive(open_documents("identifications")).keep(found.report)
-    if report is not None:
-        write_identification(found.report, report)
+    _print_revision(made)
     _write(target.output, found.machine)
     print_identification(found.report)
-    _print_revision(made)
+    kept = target.output or (made and f"{made.machine.name} revision {made.number}")
+    with told_after(kept, "report") if kept else nullcontext():
+        if made is not None:
+            # Where the service looks for them.
+            Archive(open_documents("identifications")).keep(found.report)
+        if report is not None:
+            write_identification(found.report, report)
 
 
 def _write(output: Path | None, machine: Machine) -> None:

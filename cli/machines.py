@@ -251,7 +251,8 @@ def set_firmware(
     from stillpath.applications.machines.transfer import with_firmware_file
 
     resolver = open_machines()
-    machine, source = with_firmware_file(resolver.to_look_at(name).machine, file)
+    found = resolver.to_look_at(name)
+    machine, source = with_firmware_file(found.machine, file)
     if as_name is not None:
         machine = machine.model_copy(update={"name": as_name})
     revision = resolver.store.add_revision(
@@ -260,7 +261,7 @@ def set_firmware(
         author=who(by),
         message=message or f"firmware from {file.name}",
         sources=[source],
-        expected=None if as_name is None else 0,
+        expected=found.number if as_name is None else 0,
     )
     print_revision(revision)
     for line in _refused(machine):

@@ -43,17 +43,18 @@ def motors(
             "within a full step): lower max_accel, raise the motors' current, or try again"
         )
     best, resolver = levels[count - 1], open_machines()
-    machine = resolver.to_look_at(name).machine
-    command = envelope(machine, best, margin)
+    found = resolver.to_look_at(name)
+    command = envelope(found.machine, best, margin)
     end = "no step was lost" if count == len(levels) else f"level {count + 1} lost steps"
+    revision = resolver.store.add_revision(
+        name,
+        found.machine.model_copy(update={"command": command}),
+        author=who(by),
+        message=message or f"motors tried up to {best.accel_mm_s2:.0f} mm/s2",
+        expected=found.number,
+    )
     typer.echo(
         f"borne: {best.accel_mm_s2:.0f} mm/s2, steps of {best.speed_step_mm_s:.0f} mm/s ({end}); "
         f"stored, times {margin:g}: {command.accel_mm_s2:.0f} and {command.speed_step_mm_s:.0f}"
-    )
-    revision = resolver.store.add_revision(
-        name,
-        machine.model_copy(update={"command": command}),
-        author=who(by),
-        message=message or f"motors tried up to {best.accel_mm_s2:.0f} mm/s2",
     )
     print_revision(revision)

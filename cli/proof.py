@@ -203,25 +203,24 @@ def verify(
     from stillpath.applications.proof.ring_motion import is_ring_test
 
     if is_ring_test(printed):
-        said = _verify_ring(printed, logs, found, report)
+        said = _verify_ring(printed, logs, found)
         if remember:
             _remember(machines, machine, said, who(by), message)
+        if report is not None:
+            from stillpath.reports.pages import write_texts
+
+            write_texts(report, {"ring-test.json": said.model_dump_json(indent=1)})
         return
     if len(logs) > 1:
         raise typer.BadParameter("of a print, one log is compared at a time")
     _verify_print(printed, logs[0], found, report)
 
 
-def _verify_ring(
-    printed: Path, logs: list[Path], machine: Machine, report: Path | None
-) -> RingReport:
+def _verify_ring(printed: Path, logs: list[Path], machine: Machine) -> RingReport:
     from stillpath.applications.proof.confirming import verify_ring
     from stillpath.cli.proof_tables import print_ring
-    from stillpath.reports.pages import write_texts
 
     made = verify_ring(printed, logs, machine)
-    if report is not None:
-        write_texts(report, {"ring-test.json": made.model_dump_json(indent=1)})
     print_ring(made)
     return made
 
@@ -234,9 +233,9 @@ def _verify_print(printed: Path, log: Path, machine: Machine, report: Path | Non
 
     with progress_shown() as progress:
         made = verify_log(printed, log, machine, progress=progress)
+    print_readback(made)
     if report is not None:
         write_readback(made, report)
-    print_readback(made)
 
 
 def _remember(machines: Resolver, name: str, report: RingReport, author: str, message: str) -> None:

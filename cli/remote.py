@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import typer
 
-from stillpath.cli.arguments import KeyOption, Refused, ServerOption
+from stillpath.cli.arguments import KeyOption, Refused, ServerOption, check_output
 
 if TYPE_CHECKING:
     from stillpath.pipeline.options import Options
@@ -143,15 +143,16 @@ def fetch(
 
     with interruptible_at_once(), _client(server, key) as client:
         found = client.job(job)
-        target = output or Path(safe_name(found.result_name))
-        if output is None and target.exists():
-            raise Refused(f"{target} exists; name the file with -o to replace it")
+        named = output or Path(safe_name(found.result_name))
+        if output is None and named.exists():
+            raise Refused(f"{named} exists; name the file with -o to replace it")
+        target = check_output(named)
         with _progress() as tell:
             client.fetch(found, target, tell=tell)
         if report is not None:
             with told_after(target, "report"):
                 client.save_report(found.id, report)
-    sys.stdout.write(f"{target}\n")
+    sys.stdout.write(f"{named}\n")
 
 
 @app.command()

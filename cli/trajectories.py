@@ -45,7 +45,7 @@ def trajectories(
     dialect: DialectOption = None,
 ) -> None:
     """Write planned, commanded and simulated motion with the errors, 1000 rows a second."""
-    chosen = form or ("npz" if output.suffix == ".npz" else "csv")
+    chosen = form or ("npz" if output.suffix.lower() == ".npz" else "csv")
     if chosen not in ("csv", "npz"):
         raise typer.BadParameter(f"--format {form}: choose csv or npz")
     check_input(source)

@@ -111,6 +111,8 @@ class TwoSidedFilter:
         fir : ndarray, shape (2 l + 1,), optional
             A symmetric (zero-phase) filter on top.
         """
+        if len(values) == 0:
+            return np.empty(0)
         half = 0 if fir is None else len(fir) // 2
         taps = self.taps if fir is None else np.convolve(self.taps, fir)
         ahead = self.preview + half

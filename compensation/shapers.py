@@ -71,6 +71,8 @@ def shape(
     out = np.empty_like(command) if out is None else out
     out[...] = 0.0
     n = command.shape[-1]
+    if n == 0:
+        return out
     for row, shaped in zip(command.reshape(-1, n), out.reshape(-1, n), strict=True):
         add_delayed(row, samples[used], gains[used], shaped)
     return out

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from stillpath.models.errors import ModelError
 from stillpath.models.roots import Roots
 
 __all__ = ["balanced", "cascade", "transmission_zeros"]
@@ -16,6 +17,9 @@ __all__ = ["balanced", "cascade", "transmission_zeros"]
 Matrix = NDArray[np.float64]
 System = tuple[Matrix, Matrix, Matrix, float]
 _Group = NDArray[np.complex128]
+
+_LEAST_DECAY = 1e-14
+"""Of a pole, relative: with less the Gramians are rounding."""
 
 
 def cascade(roots: Roots) -> System:
@@ -44,6 +48,11 @@ def balanced(a: Matrix, b: Matrix, c: Matrix, d: float, *, discrete: bool) -> Sy
 
     Diagonal balancing: equal diagonals of both Gramians. Unlike a full balancing it needs no
     inverse, and so it survives zeros that almost cancel poles.
+
+    Raises
+    ------
+    ModelError
+        A pole lies on the edge of stability within rounding.
     """
     # Slow to import, and not needed to check a document.
     from scipy.linalg import solve_discrete_lyapunov
@@ -51,6 +60,13 @@ def balanced(a: Matrix, b: Matrix, c: Matrix, d: float, *, discrete: bool) -> Sy
     if len(b) == 0:
         return a, b, c, d
     solve = solve_discrete_lyapunov if discrete else _solve_continuous
+    poles = np.linalg.eigvals(a)
+    decay = 1.0 - np.abs(poles) if discrete else -poles.real / np.maximum(np.abs(poles), 1e-300)
+    if decay.min() < _LEAST_DECAY:
+        raise ModelError(
+            "the plant has a resonance that never dies away (damping of 0 within rounding): "
+            "correct its damping"
+        )
     reached = np.abs(np.diag(solve(a, np.outer(b, b))))
     seen = np.abs(np.diag(solve(a.T, np.outer(c, c))))
     used = (reached > 0) & (seen > 0)

@@ -8,13 +8,12 @@ from functools import cache
 from pathlib import Path
 
 from pydantic import ValidationError
-from pydantic_core import from_json
 
 from stillpath.models.complaints import complaint
 from stillpath.models.errors import ModelError
 from stillpath.models.firmware import FIRMWARE_KINDS
 from stillpath.models.machine import Machine
-from stillpath.models.user_files import as_utf8
+from stillpath.models.user_files import as_json
 
 __all__ = [
     "builtin_machines",
@@ -81,11 +80,7 @@ def read_machine(document: str | bytes, source: str = "machine") -> Machine:
     ModelError
         Naming the first field that is wrong, its value and what it must be.
     """
-    try:
-        content = document.encode() if isinstance(document, str) else document
-        parsed = from_json(as_utf8(content))
-    except ValueError as error:
-        raise ModelError(f"{source}: not JSON ({error})") from None
+    parsed = as_json(document.encode() if isinstance(document, str) else document, source)
     try:
         return Machine.model_validate(parsed)
     except ValidationError as error:

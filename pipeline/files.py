@@ -8,7 +8,6 @@ import json
 import os
 import secrets
 import sys
-import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from pathlib import Path
@@ -58,16 +57,20 @@ def replacing(target: Path, mode: int | None = None) -> Iterator[Path]:
     """
     if target.exists() and not target.is_file():
         raise OSError(errno.EINVAL, "is not a regular file; name one to write", str(target))
-    handle = _open_unnamed(target.parent)
-    temporary = _named(target) if handle is None else _path_of(handle)
+    if mode is None and target.exists():
+        mode = target.stat().st_mode
+    # Of a new file the system takes off what the umask says: to ask for it would change it for all
+    # threads.
+    first_mode = 0o666 if mode is None else 0o600
+    handle = _open_unnamed(target.parent, first_mode)
+    temporary = _named(target, first_mode) if handle is None else _path_of(handle)
     try:
         yield temporary
-        if mode is None:
-            mode = target.stat().st_mode if target.exists() else 0o666 & ~_umask()
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())
-        with contextlib.suppress(OSError):  # file systems of memory cards have no modes
-            temporary.chmod(mode & 0o7777)
+        if mode is not None:
+            with contextlib.suppress(OSError):  # file systems of memory cards have no modes
+                temporary.chmod(mode & 0o7777)
         if handle is not None:
             temporary = _link(handle, target)
         temporary.replace(target)
@@ -122,23 +125,26 @@ def result_name(name: str) -> str:
     return f"{name[: len(name) - len(suffix)]}.stillpath{suffix or '.gcode'}"
 
 
-def _named(target: Path) -> Path:
-    prefix = f".{target.name[:_NAME_PART]}."
+def _part(target: Path) -> Path:
+    return target.with_name(f".{target.name[:_NAME_PART]}.{secrets.token_hex(4)}.part")
+
+
+def _named(target: Path, mode: int) -> Path:
+    name = _part(target)
     try:
-        handle, name = tempfile.mkstemp(dir=target.parent, prefix=prefix, suffix=".part")
+        os.close(os.open(name, os.O_CREAT | os.O_EXCL | os.O_RDWR, mode))
     except OSError as error:
         error.filename = str(target.parent)  # nobody knows the temporary file
         raise
-    os.close(handle)
-    return Path(name)
+    return name
 
 
-def _open_unnamed(folder: Path) -> int | None:
+def _open_unnamed(folder: Path, mode: int) -> int | None:
     """Open a file without a name; None where that is not supported."""
     if sys.platform != "linux":
         return None
     try:
-        handle = os.open(folder, os.O_TMPFILE | os.O_RDWR | os.O_CLOEXEC, 0o600)
+        handle = os.open(folder, os.O_TMPFILE | os.O_RDWR | os.O_CLOEXEC, mode)
     except OSError:
         return None
     if _path_of(handle).exists():
@@ -153,7 +159,7 @@ def _path_of(handle: int) -> Path:
 
 def _link(handle: int, target: Path) -> Path:
     """Link an unnamed file beside `target`, as a link cannot replace an existing file."""
-    name = target.with_name(f".{target.name[:_NAME_PART]}.{secrets.token_hex(4)}.part")
+    name = _part(target)
     # Python follows links only if given a directory handle, which absolute paths ignore.
     os.link(_path_of(handle), name, src_dir_fd=handle, follow_symlinks=True)
     return name
@@ -187,9 +193,3 @@ def default_cache_dir() -> Path:
     """Return the user's folder for results that are kept between jobs."""
     base = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA")
     return (Path(base) if base else Path.home() / ".cache") / "stillpath"
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask

@@ -23,7 +23,9 @@ def wrong_option(error: ValidationError, called: Mapping[str, str] | None = None
         Field to option, where one is not called like the other.
     """
     first = error.errors(include_url=False)[0]
-    field = str(first["loc"][0]) if first["loc"] else "options"
+    if not first["loc"]:
+        return complaint(first, repeat=False)
+    field = str(first["loc"][0])
     option = (called or {}).get(field, field).replace("_", "-")
     return f"--{option}: {complaint(first)}"
 

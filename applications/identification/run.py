@@ -99,12 +99,7 @@ def identify_files(
         If a file cannot be used (the message names it), or its plants do not fit the machine.
     """
     settings = settings or ReadSettings()
-    measured: list[Measured] = []
-    for file in files:
-        if progress is not None:
-            progress(f"reading {file.name}", 0.0)
-        read = read_content(file.content, file.name, settings=settings)
-        measured += [Measured(measurement, file.condition) for measurement in read]
+    measured = _read(files, settings, progress)
     sources = [file.source for file in files]
     identified = identify(
         measured, settings, sources=sources, max_order=max_order, progress=progress
@@ -115,6 +110,26 @@ def identify_files(
     machine = _with_plants(base, found, name, title)
     report = identification_report(machine, base, found, settings, sources)
     return Identified(machine, report)
+
+
+def _read(
+    files: Sequence[InputFile], settings: ReadSettings, progress: Progress | None
+) -> list[Measured]:
+    """Read all files; refuse a copy, which would be taken for a repeat that scatters by nothing."""
+    measured: list[Measured] = []
+    known: dict[tuple[str | None, Condition, bytes], InputFile] = {}
+    for file in files:
+        if progress is not None:
+            progress(f"reading {file.name}", 0.0)
+        for measurement in read_content(file.content, file.name, settings=settings):
+            first = known.setdefault((measurement.axis, file.condition, file.content), file)
+            if first is not file:
+                raise ModelError(
+                    f"{file.name} is a copy of {first.name}, and a copy is no repeat: give each "
+                    "recording once"
+                )
+            measured.append(Measured(measurement, file.condition))
+    return measured
 
 
 def _check_sampled(axis: Axis, plant: PlantSpec) -> None:

@@ -184,9 +184,7 @@ def machine_from_config(config: PrinterConfig, stated: StatedMachine) -> Machine
         "title": stated.title or stated.name,
         "source": config.name,
         "axes": {
-            axis: stated_axis(
-                given or config.number("input_shaper", f"shaper_freq_{axis}", 0), stated.zeta
-            )
+            axis: stated_axis(given or _shaper_hz(config, axis), stated.zeta)
             for axis, given in zip("xy", stated.f_hz, strict=True)
         },
     }
@@ -199,6 +197,12 @@ def machine_from_config(config: PrinterConfig, stated: StatedMachine) -> Machine
         hint = "".join(f"; {line}" for line in not_followed(config))
         raise ModelError(f"{config.name}: {explain(error)}{hint}") from None
     return machine.model_copy(update={"command": derived_envelope(machine)})
+
+
+def _shaper_hz(config: PrinterConfig, axis: str) -> float:
+    """Return the frequency of an axis's shaper, or of its smoother (Kalico); 0: it has none."""
+    options = (f"{kind}_freq_{axis}" for kind in ("shaper", "smoother"))
+    return max(config.number("input_shaper", option, 0.0) for option in options)
 
 
 def _check_kinematics(config: PrinterConfig) -> None:

@@ -293,10 +293,11 @@ def _shaper(config: PrinterConfig) -> list[Fact]:
         except ValueError as error:
             raise ModelError(f"{config.name}: [{section}] shaper_type_{axis}: {error}") from None
         found.append(Fact(section, f"shaper_type_{axis}", f"{place}.type_{axis}", kind))
+        option = "smoother_freq" if kind.startswith("smooth_") else "shaper_freq"
         found += _numbers(
             config,
             section,
-            (f"shaper_freq_{axis}", f"{place}.freq_{axis}_hz", 0.0),
+            (f"{option}_{axis}", f"{place}.freq_{axis}_hz", 0.0),
             (f"damping_ratio_{axis}", f"{place}.damping_{axis}", 0.1),
         )
     return found

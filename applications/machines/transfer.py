@@ -22,7 +22,7 @@ from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
 from stillpath.models.provenance import SourceFile
 from stillpath.models.store import explain, read_machine
-from stillpath.models.user_files import as_utf8, read_bytes
+from stillpath.models.user_files import as_json, as_utf8, read_bytes
 
 __all__ = ["export_history", "import_file", "with_firmware_file"]
 
@@ -109,11 +109,10 @@ def with_firmware_file(machine: Machine, file: Path) -> tuple[Machine, SourceFil
     if looks_like_m503(text):
         return with_m503(machine, text, file.name), source_file(file.name, content)
     try:
-        section = from_json(as_utf8(content))
-    except ValueError as error:
+        section = as_json(content, str(file))
+    except ModelError as error:
         raise ModelError(
-            f"{file}: neither a section as JSON ({error}) nor an answer to M503, which has M92 and "
-            "M203 in it"
+            f"{error}; a firmware section as JSON is needed, or an answer to M503 with its M92"
         ) from None
     if not isinstance(section, dict) or "kind" not in section:
         raise ModelError(f"{file}: a firmware section is an object that says its kind")

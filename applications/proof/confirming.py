@@ -6,7 +6,7 @@ A log counts only if it contains the motion of the file, and enough of it above 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
@@ -40,6 +40,7 @@ from stillpath.applications.proof.ring_test import AXES, Axis
 from stillpath.models.arrays import Array
 from stillpath.models.confirmation import Confirmation, plants_digest, um_text
 from stillpath.models.errors import ModelError
+from stillpath.models.identification.types import AccelerationLog
 from stillpath.models.machine import Machine
 from stillpath.models.plants import PlantSetSpec, discretise
 from stillpath.models.provenance import SourceFile
@@ -97,10 +98,7 @@ def verify_ring(
     if machine.schedules:
         notes.append("The model follows mass or position; predicted is what the nominal plants do.")
     axes = {axis: _Axis(machine, motion, axis, today or date.today()) for axis in AXES}
-    for path in logs:
-        recorded = read_log(path, "give what was logged while the ring test ran")
-        notes += recorded.notes
-        source = SourceFile(name=path.name, sha256=hashlib.sha256(path.read_bytes()).hexdigest())
+    for source, recorded in _recordings(logs, notes):
         try:
             signal, found = place(recorded, nominal)
         except ModelError as error:
@@ -109,7 +107,7 @@ def verify_ring(
         if found.explained < _MATCHED or found.plan_end_s <= found.plan_start_s:
             _give_reason(
                 axes.values(),
-                f"{path.name} is not of this file: the best place explains "
+                f"{source.name} is not of this file: the best place explains "
                 f"{100 * found.explained:.0f} % of what the sensor felt between 2 and 22 Hz",
             )
             continue
@@ -127,6 +125,22 @@ def verify_ring(
         axes=_delays_compared(judged),
         notes=list(dict.fromkeys(notes)),
     )
+
+
+def _recordings(
+    logs: Sequence[Path], notes: list[str]
+) -> Iterator[tuple[SourceFile, AccelerationLog]]:
+    """Yield all logs once; the stops of a copy would be repeats that scatter by nothing."""
+    known: dict[str, str] = {}
+    for path in logs:
+        recorded = read_log(path, "give what was logged while the ring test ran")
+        source = SourceFile(name=path.name, sha256=hashlib.sha256(path.read_bytes()).hexdigest())
+        if source.sha256 in known:
+            notes.append(f"{path.name} is a copy of {known[source.sha256]}: it counts once.")
+            continue
+        known[source.sha256] = path.name
+        notes += recorded.notes
+        yield source, recorded
 
 
 def _give_reason(axes: Iterable[_Axis], reason: str) -> None:

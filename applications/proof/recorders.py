@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import math
+import re
 from dataclasses import dataclass
 
+from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
 
 __all__ = ["Recorder", "RingSettings", "recorder_for"]
@@ -14,6 +16,17 @@ _RATES_HZ = (1300.0, 1700.0)
 """Sampling rates of the accelerometers that RepRapFirmware supports, with a margin."""
 _MOST_SAMPLES = 65535
 """S of M956 holds 16 bits (RepRapFirmware src/Accelerometers/Accelerometers.cpp, 3.4 to 3.6)."""
+_CHIPS = {
+    "klipper": (
+        re.compile(r"""[^\s;#*="']+"""),
+        "CHIP of ACCELEROMETER_MEASURE is one word: of a section [adxl345 head] it is head",
+    ),
+    "reprapfirmware": (
+        re.compile(r"\d+(\.\d+)?"),
+        "P of M956 is a number, such as 0 or 121.0",
+    ),
+}
+"""Names of a sensor that the firmware takes; the file would stop at others, homed and logging."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,11 +88,21 @@ class Recorder:
 
 
 def recorder_for(machine: Machine, settings: RingSettings) -> Recorder:
-    """Return the recorder of a machine's firmware."""
+    """Return the recorder of a machine's firmware.
+
+    Raises
+    ------
+    ModelError
+        The firmware does not take a sensor's name.
+    """
+    kind = machine.firmware.kind
+    for chip in filter(None, (settings.chip_x, settings.chip_y)):
+        if kind in _CHIPS and not _CHIPS[kind][0].fullmatch(chip):
+            raise ModelError(f"the sensor {chip!r:.80} (--chip, --chip-y): {_CHIPS[kind][1]}")
     kinds: dict[str, type[Recorder]] = {"klipper": _Klipper, "reprapfirmware": _RepRap}
     plain = machine.model_copy(update={"confirmations": {}})
     digest = hashlib.sha256(f"{plain.revision} {settings}".encode()).hexdigest()[:6]
-    return kinds.get(machine.firmware.kind, Recorder)(settings, f"ring-{digest}")
+    return kinds.get(kind, Recorder)(settings, f"ring-{digest}")
 
 
 class _Klipper(Recorder):

@@ -58,12 +58,21 @@ class FrequencyTracker:
             raise DesignError(f"{tones} tones; between 1 and 8 can be told apart")
         self._tones, self._dt_s, self._floor = tones, dt_s, floor_rms
         self._now = _Estimate.fresh(tones)
+        self._found: tuple[float, ...] = ()
         self.jumped = False
 
     def push(self, x: Array) -> tuple[float, ...]:
-        """Return the frequencies [Hz], rising, after samples x (n,); () while there are none."""
-        now = self._now
+        """Return the frequencies [Hz], rising, after samples x (n,); () while there are none.
+
+        Samples that are no numbers count as 0: one would stay in the recursion for good.
+        """
         self.jumped = False
+        if len(x):
+            self._found = self._pushed(_numbers(x))
+        return self._found
+
+    def _pushed(self, x: Array) -> tuple[float, ...]:
+        now = self._now
         power = float(np.mean(x**2))
         if math.sqrt(power) < self._floor:
             return self._restart() if now.heard else ()
@@ -148,7 +157,7 @@ class AdaptiveFmsdob:
 
     def hear(self, dhat: Array) -> Retuning | None:
         """Return new coefficients after the samples `dhat`, shape (n,); None: no change."""
-        disturbance, self._memory = lfilter(*self._unloop, dhat, zi=self._memory)
+        disturbance, self._memory = lfilter(*self._unloop, _numbers(dhat), zi=self._memory)
         found = self.tracker.push(disturbance)
         moved, self._last = _apart(found, self._last), found
         if moved > 0.25 * self._bandwidth_hz:
@@ -224,6 +233,11 @@ class _Estimate:
         """Return whether the residual is larger than noise would leave."""
         error, filtered, signal = self.levels
         return bool(error > _LEFT_BEHIND_POLES * filtered or error > _LEFT_OF_SIGNAL * signal)
+
+
+def _numbers(x: Array) -> Array:
+    """Return samples with 0 in place of those that a sensor did not give."""
+    return np.where(np.isfinite(x), x, 0.0)
 
 
 def _cosines(theta: Array) -> Array:

@@ -31,6 +31,8 @@ def preview_command(loop: Loop, y_d: Array) -> Array:
     DesignError
         If the windows' recursion is not stable, or the functions are nearly dependent.
     """
+    if len(y_d) == 0:
+        return np.empty(0)
     lifted = lifted_window([reference_plant(loop)], [1.0], _WINDOW, _UPDATE)
     design = PreviewDesign(lifted, _FUNCTIONS)
     windows = -(-len(y_d) // _UPDATE)

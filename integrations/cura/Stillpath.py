@@ -132,7 +132,8 @@ _SETTINGS: dict[str, dict[str, Any]] = {
     },
     "features": {
         "label": "Compensate",
-        "description": "What is compensated. The rest stays as sliced, and the file is smaller.",
+        "description": "What is compensated. The rest stays as sliced, and the file is smaller. "
+        "Everywhere with a budget.",
         "type": "enum",
         "options": {
             "all": "everywhere",
@@ -273,7 +274,7 @@ class Stillpath(Script):
         options = {name: self._value(name) for name in names}
         if self._value("budget_um"):
             options["budget_um"] = self._value("budget_um")
-        elif self._value("features") != "all":
+        if self._value("features") != "all":
             options["where"] = self._value("features")
         return options if options["method"] == "fbf" else {**options, "robust": "auto"}
 

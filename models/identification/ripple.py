@@ -171,7 +171,8 @@ def update_ripple(
     Parameters
     ----------
     known, learnt : AxisRipple
-        Harmonics that only one of them lists count as zero in the other.
+        Harmonics that `learnt` lists alone count as zero in `known`; those that it does not list
+        were not looked for, and stay.
     gain : float
         1: take the new as it is; smaller: average over passes, against noise.
     remaining : bool
@@ -198,8 +199,11 @@ def update_ripple(
     merged: dict[tuple[str, float, RippleSide], list[RippleHarmonic]] = {}
     for wave in dict.fromkeys([*old, *new]):
         c_before, sd_before = old.get(wave, (0j, 0.0))
-        c_learnt, sd_learnt = new.get(wave, (0j, 0.0))
-        c, sd = keep * c_before + gain * c_learnt, math.hypot(keep * sd_before, gain * sd_learnt)
+        c, sd = c_before, sd_before
+        if wave in new:
+            c_learnt, sd_learnt = new[wave]
+            c = keep * c_before + gain * c_learnt
+            sd = math.hypot(keep * sd_before, gain * sd_learnt)
         merged.setdefault(wave[:3], []).append(_harmonic(wave[3], c, sd))
     return _axis_ripple(
         tuple(

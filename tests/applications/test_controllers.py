@@ -290,6 +290,9 @@ def test_own_machine_and_options_from_files(
     loaded = load_controller(tmp_path / "c.json")
     assert loaded.spec.name == "mine"
     assert loaded.options == read_options(json.loads(options.read_text()) | {"detuning": 0.9})
+    both = str(tmp_path / "both")
+    assert run([*asked, "--json", both, "--c-header", both]) == 2
+    assert "name two files" in capsys.readouterr().err
     options.write_text("[1")
     assert run(asked) == 2
     assert "not JSON" in capsys.readouterr().err

@@ -132,6 +132,21 @@ def test_one_axis_leaves_the_other(store: MachineStore, folder: Path) -> None:
     assert store.current("mine").message == "identified from raw_data_y_20260101_120000.csv"
 
 
+def test_a_report_without_room_leaves_the_revision_and_is_told(
+    store: MachineStore, folder: Path, capsys
+) -> None:
+    (file,) = placed([quick_raw("y")], folder)
+    (folder / "full").write_text("a file where a folder is needed")
+    report = folder / "full" / "report"
+    assert identify(file, "-m", "mine", "--report", report) == 0
+    said = capsys.readouterr()
+    assert "mine revision 2: content" in said.out
+    assert "stillpath: warning: mine revision 2 is written; no report: " in said.err
+    # Nothing else was asked for: then it is a failure.
+    assert identify(file, "--report", report) == 1
+    assert "Not a directory" in one_line(capsys)
+
+
 def test_a_new_machine_needs_a_base(store: MachineStore, folder: Path, capsys) -> None:
     (file,) = placed([quick_raw("x")], folder)
     assert identify(file, "-m", "new") == 2
@@ -294,6 +309,7 @@ def test_one_broken_file_among_good_ones(store: MachineStore, folder: Path, caps
         ("{file} --report {file}", "--report"),
         ("{folder}/none.csv", "none.csv"),
         ("{folder}", "cannot read"),
+        ("{file} {file}", "is a copy of raw_data_x_20260101_120000.csv"),
         ("{file}@+0.5lb", "neither a weight"),
         ("{file}@+0.5kg", "every run has a weight"),
         ("{file} --accel-per-hz -1", "--accel-per-hz: must be more than 0"),

@@ -90,7 +90,8 @@ def test_a_firmware_that_executes_no_stream_is_told_at_once(capsys, tmp_path) ->
 @pytest.mark.parametrize(
     ("section", "message"),
     [
-        ("{", "neither a section as JSON"),
+        ("{", "at line 1 column 1); a firmware section as JSON is needed, or an answer to M503"),
+        ('{"kind": "klipper", "kind": "marlin"}', "'kind' is there twice; keep one of them"),
         ("[]", "says its kind"),
         ('{"planner": {}}', "says its kind"),
         ('{"kind": "grbl"}', "firmware: kind must be klipper, marlin or reprapfirmware"),

@@ -139,6 +139,8 @@ def test_from_the_search_to_the_machine(
     assert run(["motor-test", "--machine", "mine", "-o", str(written), "--to", "9000"]) == 0
     best = levels_of(written.read_text())[2]
     said.write_text(console((5, 5), (5, 5), (6, 5), (5, 9), (5, 90)))
+    assert run(["machines", "motors", "ender3", str(written), str(said)]) == 2
+    assert "stored" not in capsys.readouterr().out  # as it is built in
     assert run(["machines", "motors", "mine", str(written), str(said), "--margin", ".8"]) == 0
     assert "level 4 lost steps" in capsys.readouterr().out
     assert run(["machines", "show", "mine"]) == 0

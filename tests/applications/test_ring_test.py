@@ -107,6 +107,26 @@ def logged_lines(machine: Machine, settings: RingSettings) -> list[str]:
     return [*logged, logged[-1].partition("NAME=")[2]]
 
 
+@pytest.mark.parametrize(
+    ("kind", "chip", "words"),
+    [
+        ("klipper", "adxl345 head", r"one word: of a section \[adxl345 head\] it is head"),
+        ("klipper", "head;", "one word"),
+        ("reprapfirmware", "P0", "a number, such as 0"),
+    ],
+)
+def test_a_sensor_that_the_firmware_would_stop_at_is_refused(
+    kind: str, chip: str, words: str, machine: Machine
+) -> None:
+    """`accel_chip: adxl345 head` is what [resonance_tester] has."""
+    if kind != "klipper":
+        section = json.loads((EXAMPLES / f"{kind}.json").read_text())
+        machine = with_firmware(machine, section)
+    for settings in (RingSettings(chip), RingSettings(None, chip)):
+        with pytest.raises(ModelError, match=words):
+            RingTest(machine, settings)
+
+
 def test_logs_have_the_name_of_their_own_test(machine: Machine, told: RingReport) -> None:
     """The log of another test is not there to be taken for this one's."""
     settings = RingSettings()
@@ -171,6 +191,17 @@ def test_a_machine_like_its_plants_is_confirmed(told: RingReport, log: Path) -> 
         assert found is not None
         assert found.sources[0].name == log.name
         assert found.tested_on == TODAY
+
+
+def test_a_copy_of_a_log_is_no_repeat(
+    told: RingReport, log: Path, ring: Path, machine: Machine
+) -> None:
+    """As a browser names what it downloads again."""
+    copy = log.with_name("adxl345-ring (1).csv")
+    copy.write_bytes(log.read_bytes())
+    twice = verify_ring(ring, [log, copy], machine, today=TODAY)
+    assert twice.axes == told.axes
+    assert twice.notes == [*told.notes, f"{copy.name} is a copy of {log.name}: it counts once."]
 
 
 def test_a_mode_that_moved_is_not_confirmed(ring: Path, machine: Machine, tmp_path: Path) -> None:
@@ -297,9 +328,13 @@ def test_the_command_remembers(
     args = ["verify", str(ring), str(log), "-m", "mine"]
     assert run([*args, "--no-remember"]) == 0
     assert not store.current("mine").machine.confirmations
-    assert run([*args, "--report", str(tmp_path / "told")]) == 0
-    assert "X confirmed" in capsys.readouterr().out
+    # A report that cannot be written takes the verdict with it neither from the screen nor here.
+    assert run([*args, "--report", str(tmp_path / "mine.json" / "told")]) == 1
+    said = capsys.readouterr()
+    assert "X confirmed" in said.out
+    assert "Not a directory" in said.err
     assert set(store.current("mine").machine.confirmations) == {"x", "y"}
+    assert run([*args, "--report", str(tmp_path / "told")]) == 0
     report = json.loads((tmp_path / "told" / "ring-test.json").read_text())
     assert report["axes"][0]["verdict"] == "confirmed"
     assert np.isfinite(report["axes"][0]["misses"])

@@ -122,7 +122,8 @@ def test_preview_command_on_every_loop(name: str) -> None:
     r = preview_command(loop, y_d)
     y = lfilter(loop.tracking_num, loop.t0_den, r)
     assert np.sqrt(np.mean((y - y_d) ** 2)) < 1e-5
-    assert len(preview_command(loop, y_d[:1001])) == 1001
+    for length in (1001, 1, 0):
+        assert len(preview_command(loop, y_d[:length])) == length
 
 
 def test_files(tmp_path: Path) -> None:

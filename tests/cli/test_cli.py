@@ -154,6 +154,11 @@ def test_a_link_is_followed(pipeline, source, tmp_path):
         ("-o {folder} -m ender3", ["folder"]),
         ("-o {folder}/no/out.gcode -m ender3", ["does not exist"]),
         ("-o {out} -m ender3 --report {source}", ["--report"]),
+        ("-o - -m ender3", ["nothing is written to the standard output; name a file"]),
+        ("-o {out} -m ender3 --report {out}", ["would be the report's own"]),
+        ("-o {folder}/layers.bin -m ender3 --report {folder}", ["would be the report's own"]),
+        # Said of several options, it names them, and none that there is not.
+        ("-o {out} -m ender3 --budget-um 9 --where walls", ["error: budget_um makes the whole"]),
         ("-o {out} -m ender3 --colour blue", ["colour"]),
     ],
 )
@@ -308,6 +313,28 @@ def test_the_longest_name_that_a_file_can_have(tmp_path):
     with replacing(target) as temporary:
         temporary.write_bytes(TEXT)
     assert target.read_bytes() == TEXT
+
+
+@pytest.mark.skipif(os.name != "posix", reason="modes of POSIX")
+@pytest.mark.parametrize("platform", ["linux", "darwin"])
+def test_a_file_has_the_mode_of_new_ones(platform, tmp_path, monkeypatch):
+    """The umask is the whole process's: two threads that change it to read it may lose it."""
+    known, private, new = (tmp_path / name for name in ("known", "private", "new"))
+    known.write_bytes(TEXT)
+    usual = known.stat().st_mode & 0o777
+    private.write_bytes(TEXT)
+    private.chmod(0o640)
+    monkeypatch.setattr(sys, "platform", platform)
+    monkeypatch.setattr(os, "umask", lambda _: pytest.fail("changed for all threads"))
+    for target, asked, expected in (
+        (new, None, usual),
+        (private, None, 0o640),
+        (new, 0o600, 0o600),
+    ):
+        with replacing(target, asked) as temporary:
+            temporary.write_bytes(TEXT)
+        assert target.stat().st_mode & 0o777 == expected
+    assert len(list(tmp_path.iterdir())) == 3
 
 
 def test_a_full_disk_is_told_with_its_place(pipeline, source, tmp_path, capsys):

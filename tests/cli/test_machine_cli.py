@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from stillpath.applications.machines import transfer
 from stillpath.applications.machines.checks import check_before_job, differences
 from stillpath.applications.machines.klipper_config import read_printer_config
 from stillpath.applications.machines.store import MachineStore
@@ -152,6 +153,25 @@ def test_export_and_import(store: MachineStore, tmp_path: Path, capsys):
     assert machines("delete", "mine") == 0
     assert machines("import", history) == 0
     assert store.history("mine") == before
+
+
+def test_another_firmware_loses_no_change_made_meanwhile(
+    store: MachineStore, tmp_path: Path, capsys, monkeypatch
+):
+    store.add_revision("mine", make_machine(), author="anna")
+    file = tmp_path / "firmware.json"
+    file.write_text(make_machine().firmware.model_dump_json())
+    original = transfer.with_firmware_file
+
+    def slowly(*arguments):
+        made = original(*arguments)
+        store.add_revision("mine", make_machine(mesh_slope=0.02), author="bob")
+        return made
+
+    monkeypatch.setattr(transfer, "with_firmware_file", slowly)
+    assert machines("set-firmware", "mine", file) == 2
+    assert "is at revision 2, not 1 any more" in one_line(capsys)
+    assert store.current("mine").author == "bob"
 
 
 def test_what_the_shell_of_windows_writes(store: MachineStore, tmp_path: Path, capsys):
@@ -298,6 +318,18 @@ def test_typed_in_resonances(store: MachineStore, config: Path):
     axes = store.current("mine").machine.axes
     modes = [axes[axis].nominal.modes[0] for axis in ("x", "y")]  # type: ignore[index,union-attr]
     assert [(mode.f_hz, mode.zeta) for mode in modes] == [(70.0, 0.1), (55.0, 0.1)]
+
+
+def test_a_smoother_has_a_frequency_of_its_own(store: MachineStore, config: Path):
+    """As in Kalico: there shaper_freq_x says nothing of it."""
+    smooth = CONFIG.replace("type_x: ei", "type_x: smooth_ei\nsmoother_freq_x: 70")
+    config.write_text(smooth.replace("#*# shaper_freq_x = 61.2\n", ""))
+    assert machines("from-config", config, "--name", "mine") == 0
+    machine = store.current("mine").machine
+    assert machine.axes["x"].nominal.modes[0].f_hz == 70.0  # type: ignore[union-attr]
+    shaper = machine.firmware.shaper  # type: ignore[union-attr]
+    assert (shaper.type_x, shaper.freq_x_hz) == ("smooth_ei", 70.0)  # type: ignore[union-attr]
+    assert not differences(machine, read_printer_config(config))
 
 
 @pytest.mark.parametrize("hertz", ["inf", "nan", "1e101", "501"])

@@ -35,6 +35,13 @@ def answer(machine: Machine, u: np.ndarray) -> np.ndarray:
     return np.array(rows)
 
 
+@pytest.mark.parametrize("name", ["zpetc", "ts", "shaper:mzv"])
+def test_a_piece_without_samples_has_a_command_without(name: str) -> None:
+    made = compensator(name, load_machine("ender3"), 1e-3)
+    command = made.compensate(np.zeros((2, 0)), np.zeros(0, np.bool_), NO_RESTS)
+    assert command.shape == (2, 0)
+
+
 def test_fir_of_paper_002() -> None:
     np.testing.assert_allclose(
         zero_phase_fir(500, 1e-4, 5)[5:],

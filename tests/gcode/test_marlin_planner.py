@@ -79,6 +79,12 @@ def test_the_step_rate_is_rounded_up() -> None:
     assert phases.cruise_mm_s == pytest.approx([100.3, 33.3375], rel=1e-4)
 
 
+def test_a_motor_steps_once_in_a_tick_at_most() -> None:
+    # 400 mm/s of 1000 steps per mm would be 400 kHz; a timer of 100 kHz lets 100 mm/s through.
+    fine = machine(step_timer_hz=1e5, steps_per_mm=PerAxis(x=1000.0, y=80.0, z=400.0, e=93.0))
+    assert plan(fine, [[0], [200]], 400.0, **STREAM).cruise_mm_s.max() == pytest.approx(100.0)
+
+
 def test_every_axis_keeps_its_speed() -> None:
     # Z may do 5 mm/s: a move of 3 up and 4 along takes 3/5 s, 25/3 mm/s of path.
     phases = plan(machine(), [[0, 0, 0], [4, 0, 3]], 100.0, **FAST)

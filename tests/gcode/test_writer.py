@@ -187,6 +187,10 @@ def test_shaper_of_the_machine_is_restored(
     assert len(calls) == 2
     words = lines[calls[1]].split(b" ")
     assert words[1:3] == [b"SHAPER_TYPE_X=" + written, b"SHAPER_FREQ_X=51.5"]
+    # Smoothers of Kalico and others take no notice of SHAPER_FREQ_X=0.
+    smooth = written.startswith(b"smooth_")
+    assert (b"SMOOTHER_FREQ_X=0" in lines[calls[0]].split()) is smooth
+    assert (b"SMOOTHER_FREQ_X=51.5" in words) is smooth
     assert calls[1] < len(lines) - 1 - lines[::-1].index(b"G28")
     assert pipeline.result is not None
     assert not any("shaper" in warning for warning in pipeline.result.warnings)

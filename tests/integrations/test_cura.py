@@ -169,6 +169,10 @@ def test_a_budget_is_told_only_where_there_is_one(cura: Cura, script: Any):
     assert "budget_um" not in script._options()
     script.values["budget_um"] = 12.5
     assert Options(**script._options()).budget_um == 12.5
+    # Not left out in silence: Stillpath says why it cannot be.
+    script.values["features"] = "walls"
+    with pytest.raises(ValueError, match="budget_um makes the whole print faster"):
+        Options(**script._options())
 
 
 def test_the_panel(cura: Cura):

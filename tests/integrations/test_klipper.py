@@ -5,6 +5,7 @@ On an imitation, quickly and in many orders; on Klipper's own host: `test_real_m
 
 from __future__ import annotations
 
+import copy
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -86,6 +87,25 @@ def test_ones_own_macros_move_under_ones_own_limits():
     assert printer.sent == [OWN_LIMITS, OWN_SHAPER, "G1 X0 Y0 F9000", "CANCEL_PRINT"]
     printer.run("RESUME")
     assert limits(printer)[0] == (300.0, 5000.0, 5.0, 0.5)  # nothing of the cancelled print
+
+
+def test_a_smoother_is_switched_by_its_own_frequency():
+    """Kalico's listen to no SHAPER_FREQ, and its printer.cfg says none."""
+    kalico = copy.deepcopy(SETTINGS)
+    kalico["input_shaper"] = {
+        f"{name}_{axis}": value
+        for axis, f_hz in (("x", 57.8), ("y", 45.2))
+        for name, value in (("shaper_type", "smooth_mzv"), ("smoother_freq", f_hz))
+    }
+    printer = in_stretch(OURS, settings=kalico)
+    printer.run("SET_INPUT_SHAPER SMOOTHER_FREQ_X=0 SMOOTHER_FREQ_Y=0")
+    for command, expected in (("PAUSE", (57.8, 45.2)), ("RESUME", (0.0, 0.0))):
+        printer.run(command)
+        assert tuple(printer.shaper[f"smoother_freq_{axis}"] for axis in "xy") == expected
+    printer.run("CANCEL_PRINT")
+    printer.state = "standby"
+    printer.run("STILLPATH_CHECK")
+    assert printer.shaper["smoother_freq_x"] == 57.8
 
 
 def test_resume_without_a_pause_brings_nothing_back():

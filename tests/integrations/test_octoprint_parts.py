@@ -403,6 +403,15 @@ def test_a_program_does_the_work(bench: Callable[..., Bench], tmp_path: Path):
     assert "compensating" in here.stages
 
 
+def test_a_result_without_a_report_is_kept(bench: Callable[..., Bench], tmp_path: Path):
+    """As the program does it where there is no room for the report: exit code 0."""
+    here = bench(command=_program(tmp_path, _WORKS.partition("report =")[0]))
+    entry = here.ended(here.add("a.gcode", "G1\n"))
+    assert entry.state == "done", entry
+    assert entry.message.startswith("warning: no report: ")
+    assert (here.files / "a.sp.gcode").exists()
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [

@@ -192,6 +192,10 @@ def test_dc_gain_rule() -> None:
         (lambda: ZpkSpec(poles=((-1.0, 1.0),)), "conjugate"),
         (lambda: ZpkSpec(poles=((0.0, 0.0),)), "integrator"),
         (lambda: PairsSpec(poles=(PolePair(f_hz=30, zeta=0.0),)), "greater than 0"),
+        (
+            lambda: discretise(PairsSpec(poles=(PolePair(f_hz=30, zeta=1e-20),)), 1e-3),
+            "never dies away .* correct its damping",
+        ),
         (lambda: FirSpec(taps=(float("inf"),), dt_s=1e-3), "finite"),
         (
             lambda: PlantSetSpec(

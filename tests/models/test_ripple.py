@@ -238,6 +238,18 @@ class TestUpdate:
             known = update_ripple(known, ripple(), gain=gain)
         assert learnt_error_of(known) == pytest.approx(start * (1 - gain) ** rounds, abs=1e-9)
 
+    @pytest.mark.parametrize("remaining", [False, True])
+    def test_what_was_not_looked_for_stays(self, remaining: bool) -> None:
+        """Another part, or another harmonic of this one."""
+        wave = RippleHarmonic(number=7, amplitude_um=5.0, phase_deg=20.0, sd_um=0.5)
+        other = RippleSource(name="pulley", pitch_mm=40.0, harmonics=(wave,))
+        more = RippleSource(name="belt", pitch_mm=2.0, harmonics=(wave,))
+        known = AxisRipple(sources=(more, other))
+        made = update_ripple(known, ripple(), gain=0.5, remaining=remaining)
+        belt, pulley = made.sources
+        for kept in (pulley.harmonics[0], belt.harmonics[0]):
+            assert kept.model_dump() == pytest.approx(wave.model_dump())
+
     def test_another_pitch_is_refused(self) -> None:
         other = ripple().model_copy(
             update={"sources": (ripple().sources[0].model_copy(update={"pitch_mm": 3.0}),)}

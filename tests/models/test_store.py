@@ -120,6 +120,14 @@ def test_a_wrong_field_is_named(
     assert "\n" not in str(raised.value)
 
 
+def test_a_name_that_is_there_twice_is_refused(document: dict[str, Any]) -> None:
+    """One of the values would be passed over in silence: the limit that was added by hand."""
+    document.setdefault("command", {})
+    added = json.dumps(document).replace("{", '{"command": {"accel_mm_s2": 3000}, ', 1)
+    with pytest.raises(ModelError, match=r"^mine\.json: 'command' is there twice; keep one"):
+        read_machine(added, "mine.json")
+
+
 def test_what_is_no_object_is_told_in_plain_words() -> None:
     with pytest.raises(ModelError, match=r"must be a JSON object$"):
         read_machine(b"[1]")

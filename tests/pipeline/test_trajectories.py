@@ -216,7 +216,7 @@ def test_no_such_time(
 def test_from_the_command_line(
     source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    target = tmp_path / "t.npz"
+    target = tmp_path / "t.NPZ"
     given = ["trajectories", str(source), "-m", "ender3", "-o", str(target)]
     assert run([*given, "--from", "0.1", "--to", "0.3"]) == 0
     assert "200 rows" in capsys.readouterr().out

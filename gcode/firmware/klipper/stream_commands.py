@@ -39,11 +39,11 @@ class KlipperStreamCommands:
     ignores_subcodes = False
     factors_need_axes = False
     advance_off = b""
-    shaper_off = b"SET_INPUT_SHAPER SHAPER_FREQ_X=0 SHAPER_FREQ_Y=0\n"
-    file_shaper_off = shaper_off
 
     def __init__(self, firmware: Klipper) -> None:
         self._shaper = firmware.shaper
+        off = f"SET_INPUT_SHAPER SHAPER_FREQ_X=0 SHAPER_FREQ_Y=0{self._smoothers(on=False)}\n"
+        self.shaper_off = self.file_shaper_off = off.encode()
 
     @property
     def shaper_on(self) -> bytes | None:
@@ -54,8 +54,20 @@ class KlipperStreamCommands:
         return (
             f"SET_INPUT_SHAPER SHAPER_TYPE_X={s.type_x} SHAPER_FREQ_X={s.freq_x_hz:g} "
             f"DAMPING_RATIO_X={s.damping_x:g} SHAPER_TYPE_Y={s.type_y} "
-            f"SHAPER_FREQ_Y={s.freq_y_hz:g} DAMPING_RATIO_Y={s.damping_y:g}\n"
+            f"SHAPER_FREQ_Y={s.freq_y_hz:g} DAMPING_RATIO_Y={s.damping_y:g}"
+            f"{self._smoothers(on=True)}\n"
         ).encode()
+
+    def _smoothers(self, *, on: bool) -> str:
+        """Return the words to which smoothers of forks listen, which pass over SHAPER_FREQ."""
+        if (s := self._shaper) is None:
+            return ""
+        axes = (("X", s.type_x, s.freq_x_hz), ("Y", s.type_y, s.freq_y_hz))
+        return "".join(
+            f" SMOOTHER_FREQ_{axis}={f_hz if on else 0:g}"
+            for axis, kind, f_hz in axes
+            if kind.startswith("smooth_")
+        )
 
     def shaped_axes(self, line: bytes) -> str:
         """Return the axes of SHAPER_FREQ_X and SHAPER_FREQ_Y."""

@@ -246,8 +246,8 @@ def _steps(row: Any, entry: float, leave: float, facts: Any, shape: Any) -> None
 
 @kernel(inline=True)
 def _interval(rate: float, fine: float, timer_hz: float) -> float:
-    """Time between (parts of) steps: whole ticks of the timer."""
-    return floor(timer_hz / (rate * fine)) / timer_hz
+    """Time between (parts of) steps: whole ticks of the timer, at least one."""
+    return max(floor(timer_hz / (rate * fine)), 1.0) / timer_hz
 
 
 @kernel

@@ -229,8 +229,11 @@ class ByCommand:
             else:
                 arguments += [f"--{option.replace('_', '-')}", str(value)]
         self._execute([*self._command, *arguments], folder / "said")
-        figures = json.loads((report / "report.json").read_text("utf-8"))
-        return Made(target, (report / "report.html").read_bytes(), figures)
+        try:
+            figures = json.loads((report / "report.json").read_text("utf-8"))
+            return Made(target, (report / "report.html").read_bytes(), figures)
+        except (OSError, ValueError) as error:  # a full disk: the print is right all the same
+            return Made(target, figures={"warnings": [f"no report: {error}"]})
 
     def cancel(self) -> None:
         """Nothing is left to stop: the program ends with `run`."""

@@ -45,6 +45,27 @@ def follow(
     return y, targets, seen
 
 
+@pytest.mark.parametrize("lost", [[], [np.nan], [np.inf, 1.0]])
+def test_a_sample_that_is_missing_is_got_over(lost: list[float]) -> None:
+    tone = np.sin(2 * np.pi * 700 * TS * np.arange(600))
+    tracker = FrequencyTracker(1, TS)
+    for part in (tone, np.array(lost), tone):
+        tracker.push(part)
+    assert tracker.push(tone) == pytest.approx((700.0,), abs=0.1)
+    observer = AdaptiveFmsdob(SPEC.loops(), 1)
+    for part in (tone, np.array(lost), tone, tone):
+        observer.hear(part)
+    assert observer.targets_hz == pytest.approx((700.0,), abs=0.1)
+
+
+def test_an_empty_block_changes_nothing() -> None:
+    tracker = FrequencyTracker(1, TS)
+    assert tracker.push(np.empty(0)) == ()
+    found = tracker.push(np.sin(2 * np.pi * 700 * TS * np.arange(600)))
+    assert tracker.push(np.empty(0)) == found
+    assert not tracker.jumped
+
+
 @pytest.mark.slow
 def test_published_steps() -> None:
     """Paper 000, figures 11 and 12: 500, 1500, 500, 3000, 500 Hz, then silence."""

@@ -430,6 +430,12 @@ def test_the_commands_of_jobs(
     target = tmp_path / "got.gcode"
     assert there("jobs", "fetch", made.id, "-o", target)[:2] == (0, f"{target}\n")
     assert target.read_text() == "; compensated\nG1 X41\n"
+    link = tmp_path / "link.gcode"
+    link.symlink_to(target)
+    assert there("jobs", "fetch", made.id, "-o", link)[0] == 0
+    assert link.is_symlink()
+    code, _, err = there("jobs", "fetch", made.id, "-o", tmp_path)
+    assert (code, "is a folder; name the file to write" in err) == (2, True)
     monkeypatch.chdir(tmp_path)
     code, named, _ = there("jobs", "fetch", made.id)
     assert (code, Path(named.strip()).read_bytes()) == (0, target.read_bytes())
