@@ -7,6 +7,9 @@ import pytest
 
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.fbf import PreviewFbf
+from stillpath.compensation.ladder import designs
+from stillpath.compensation.preview_axis import AxisTask, PreviewAxis
+from stillpath.compensation.window_problem import Bounds
 from stillpath.models.machine import CommandLimits, Machine
 from stillpath.models.plants import FirSpec, PlantSetSpec, plant_set
 from stillpath.models.store import load_machine
@@ -200,3 +203,31 @@ def test_an_axis_without_dynamics_is_told_its_path() -> None:
     design.observe(path[:, :1])
     command = design.compensate(path, np.ones(400, bool), np.zeros((0, 2), np.int64))
     np.testing.assert_allclose(command, path, atol=1e-3)
+
+
+def test_a_more_accurate_design_is_tried_where_the_last_refusal_leaves_room(
+    machine: Machine,
+) -> None:
+    plants = plant_set(machine.axes["x"], DT_S).members[:1]
+    axis = PreviewAxis("x", designs(plants, (1.0,), 300, 150, "ce-opt"))
+    stops = np.array([[-1, 1], [400, 700]])
+    bounds = Bounds(np.inf, np.inf, -np.inf, np.inf)
+
+    def following(rung: int, refused_mm_s2: float | None, rms_mm_s2: float) -> int:
+        """The next piece's rung, behind one that this design was accepted for."""
+        task = AxisTask(10.0 * smooth(400), np.ones(400), stops, bounds, rms_limit_mm_s2=100.0)
+        if refused_mm_s2 is not None:
+            axis.refuse(rung - 1, task, refused_mm_s2)
+        axis.accept(rung, task, rms_mm_s2)
+        axis.commit(axis.command(rung, task, frozenset()))
+        return axis.rung
+
+    assert following(2, None, 79.0) == 1
+    assert following(2, None, 81.0) == 2
+    # One rung makes commands smoother by a tenth, the other by a third.
+    assert following(2, 110.0, 99.0) == 2
+    assert following(2, None, 89.0) == 1
+    assert following(1, 120.0, 80.0) == 1
+    assert following(1, None, 67.0) == 1
+    assert following(1, None, 66.0) == 0
+    assert following(2, None, 89.0) == 1
