@@ -27,8 +27,9 @@ WEIGHT_TRAVEL = 0.2
 WEIGHT_REST = 0.5
 """Ringing during a rest is above the end of a line. A smaller weight allows more of it without any
 gain while extruding; from 1 on, accuracy while extruding suffers."""
-_ROOM = 0.8
-"""Share of the rms limit below which a more accurate rung is tried, before its own is known."""
+_ROOM, _LEAST_ROOM = 0.8, 0.6
+"""Share of the rms limit below which a more accurate rung is tried, before its own is known, and
+the least that one odd piece can make of it."""
 _FORGOTTEN = 1e-12
 """A vibration that has decayed to this share is dropped from the state."""
 
@@ -192,7 +193,7 @@ class PreviewAxis:
         piece to piece.
         """
         if self._refused is not None and self._refused[:2] == (task, rung - 1):
-            self._room[rung] = rms_mm_s2 / self._refused[2]
+            self._room[rung] = max(rms_mm_s2 / self._refused[2], _LEAST_ROOM)
         self._refused = None
         if len(task.path_mm) > self.update:
             has_room = rms_mm_s2 < self._room[rung] * task.rms_limit_mm_s2 or rung > GENTLE_RUNG

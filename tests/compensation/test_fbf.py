@@ -230,4 +230,6 @@ def test_a_more_accurate_design_is_tried_where_the_last_refusal_leaves_room(
     assert following(1, 120.0, 80.0) == 1
     assert following(1, None, 67.0) == 1
     assert following(1, None, 66.0) == 0
+    assert following(1, 300.0, 80.0) == 1
+    assert following(1, None, 59.0) == 0
     assert following(2, None, 89.0) == 1
