@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from itertools import takewhile
 
 from stillpath.gcode import _slots as at
 from stillpath.gcode.comments import note_object
@@ -97,8 +98,8 @@ def retract(state: MachineState, command: Command) -> int:
 
 def cancel_object(state: MachineState, command: Command) -> int:
     """M486: S opens an object, S-1 closes it."""
-    letters = "".join(command.words)
-    if "S" in letters.split("A", 1)[0]:  # behind A is a name
+    # Behind A is a name.
+    if "S" in takewhile(lambda letter: letter[0] != "A", command.words):
         number = command.words["S"]
         closing = number.startswith("-") or not number
         state.settle()

@@ -179,17 +179,21 @@ def machine_from_config(config: PrinterConfig, stated: StatedMachine) -> Machine
     ModelError
         If the configuration lacks something, or is of an unknown kind of machine.
     """
+    _check_kinematics(config)
+    found = facts(config)
+    shaper_hz = {fact.place: fact.value for fact in found}
     document: dict[str, Any] = {
         "name": stated.name,
         "title": stated.title or stated.name,
         "source": config.name,
         "axes": {
-            axis: stated_axis(given or _shaper_hz(config, axis), stated.zeta)
+            axis: stated_axis(
+                given or shaper_hz.get(f"firmware.shaper.freq_{axis}_hz", 0.0), stated.zeta
+            )
             for axis, given in zip("xy", stated.f_hz, strict=True)
         },
     }
-    _check_kinematics(config)
-    for fact in facts(config):
+    for fact in found:
         _put(document, fact)
     try:
         machine = Machine.model_validate(document)
@@ -197,12 +201,6 @@ def machine_from_config(config: PrinterConfig, stated: StatedMachine) -> Machine
         hint = "".join(f"; {line}" for line in not_followed(config))
         raise ModelError(f"{config.name}: {explain(error)}{hint}") from None
     return machine.model_copy(update={"command": derived_envelope(machine)})
-
-
-def _shaper_hz(config: PrinterConfig, axis: str) -> float:
-    """Return the frequency of an axis's shaper, or of its smoother (Kalico); 0: it has none."""
-    options = (f"{kind}_freq_{axis}" for kind in ("shaper", "smoother"))
-    return max(config.number("input_shaper", option, 0.0) for option in options)
 
 
 def _check_kinematics(config: PrinterConfig) -> None:

@@ -401,9 +401,8 @@ class StreamWriter:
     def _off(self, verbatim: VerbatimPart, extruder_mm: float) -> bytes:
         """Return lines that restore the file's state."""
         shaper, limits = self._shaper_before(verbatim), verbatim.limits_before
-        known = self._stream_commands.shaper_on is not None or self._file_shapers.lines
         begins = self._shaper_off and self._marked is None
-        if begins and (known or isinstance(verbatim, LeftOut)):
+        if begins and (self._shaper_is_known or isinstance(verbatim, LeftOut)):
             self._marked, limits = limits, self._stream_commands.in_stream(limits)
         if not self._streaming:
             marking = limits is not verbatim.limits_before
@@ -463,9 +462,14 @@ class StreamWriter:
         # A line that sets part of the shaper must find the other parts unchanged.
         foreign = bool(np.any(np.isin(verbatim.events.kind, _MAY_SET_SHAPER)))
         aside = isinstance(verbatim, LeftOut)  # between streams again and again
-        if (prints and not aside) or foreign:
+        restores = self._shaper_is_known or self._marked is not None
+        if foreign or (prints and not aside and restores):
             return self._shaper_on(verbatim.limits_before)
-        return self._advance_on(verbatim.limits_before) if prints else b""
+        return self._advance_on(verbatim.limits_before) if prints and aside else b""
+
+    @property
+    def _shaper_is_known(self) -> bool:
+        return self._stream_commands.shaper_on is not None or bool(self._file_shapers.lines)
 
     def _advance_on(self, limits: Limits) -> bytes:
         if not self._shaper_off or self._advances:

@@ -321,12 +321,14 @@ def test_typed_in_resonances(store: MachineStore, config: Path):
 
 
 def test_a_smoother_has_a_frequency_of_its_own(store: MachineStore, config: Path):
-    """As in Kalico: there shaper_freq_x says nothing of it."""
+    """As in Kalico: what the other kind has left in the file says nothing of it."""
     smooth = CONFIG.replace("type_x: ei", "type_x: smooth_ei\nsmoother_freq_x: 70")
-    config.write_text(smooth.replace("#*# shaper_freq_x = 61.2\n", ""))
+    smooth = smooth.replace("#*# shaper_freq_x = 61.2\n", "#*# shaper_freq_x = 81.2\n")
+    config.write_text(smooth.replace("2hump_ei\n", "2hump_ei\n#*# smoother_freq_y = 90\n"))
     assert machines("from-config", config, "--name", "mine") == 0
     machine = store.current("mine").machine
-    assert machine.axes["x"].nominal.modes[0].f_hz == 70.0  # type: ignore[union-attr]
+    modes = [machine.axes[axis].nominal.modes[0].f_hz for axis in "xy"]  # type: ignore[union-attr]
+    assert modes == [70.0, 45.0]
     shaper = machine.firmware.shaper  # type: ignore[union-attr]
     assert (shaper.type_x, shaper.freq_x_hz) == ("smooth_ei", 70.0)  # type: ignore[union-attr]
     assert not differences(machine, read_printer_config(config))

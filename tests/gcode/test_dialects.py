@@ -509,7 +509,8 @@ def test_temperatures_of_a_tool_move_nothing(read) -> None:
 @pytest.mark.parametrize("name", ALL)
 def test_the_name_of_an_object_ends_none(read, name: str) -> None:
     """PrusaSlicer writes M486 A and the name; that of a MeshShape holds an S."""
-    block, _ = read("M486 S3\nM486 AMeshShape id:0\nG1 X1 F600\nM486 S-1\nG1 X2\n", name)
+    text = "M486 S3\nM486 AMeshShape id:0\nG1 X1 F600\nM486 S-1\n"
+    block, _ = read(f"{text}M486 USED\nG1 X2\n", name)  # the last one is nothing that exists
     assert block.moves.object_id.tolist() == [0, -1]
 
 

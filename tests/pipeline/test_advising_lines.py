@@ -130,6 +130,17 @@ def test_every_firmwares_words_are_read_as_they_are_written() -> None:
     assert len(found) == 4
 
 
+def test_a_smoother_is_set_by_its_own_frequency() -> None:
+    """Kalico's pass over SHAPER_FREQ, also where the machine's own is set again."""
+    machine = klipper()
+    adviser = adapter(machine).adviser(Interpreter(machine).dialect)
+    wanted = Shaping(AxisShaper("smooth_ei", 61.5), AxisShaper("mzv", 40.0))
+    (line,) = adviser.shaper_lines(wanted)
+    assert line.count(b"SMOOTHER_FREQ") == line.count(b" SMOOTHER_FREQ_X=61.5 ") == 1
+    read = line.decode().replace(" SHAPER_FREQ_X=61.5", " SHAPER_FREQ_X=50")
+    assert adviser.read_shaper(read, Shaping()) == wanted
+
+
 @pytest.mark.parametrize(
     ("version", "lines", "own"),
     [

@@ -71,6 +71,8 @@ class KlipperAdviser:
         for axis, s in (("X", shaping.x), ("Y", shaping.y)):
             if s.type != "none":
                 words.append(f"SHAPER_TYPE_{axis}={s.type}")
+            if s.type.startswith("smooth_"):  # a fork's, which passes over SHAPER_FREQ
+                words.append(f"SMOOTHER_FREQ_{axis}={s.f_hz:.10g}")
             words.append(f"SHAPER_FREQ_{axis}={s.f_hz:.10g} DAMPING_RATIO_{axis}={s.damping:.10g}")
         return (" ".join(words).encode(),)
 
@@ -82,12 +84,13 @@ class KlipperAdviser:
         given = extended_parameters(text, command.name)
         axes = []
         for axis, s in (("X", now.x), ("Y", now.y)):
-            kind = given.get(f"SHAPER_TYPE_{axis}", given.get("SHAPER_TYPE", s.type))
+            kind = given.get(f"SHAPER_TYPE_{axis}", given.get("SHAPER_TYPE", s.type)).lower()
+            option = "SMOOTHER_FREQ" if kind.startswith("smooth_") else "SHAPER_FREQ"
             axes.append(
                 AxisShaper(
                     # Nothing said yet: Klipper's default type.
-                    "mzv" if kind == "none" else kind.lower(),
-                    float(given.get(f"SHAPER_FREQ_{axis}", s.f_hz)),
+                    "mzv" if kind == "none" else kind,
+                    float(given.get(f"{option}_{axis}", s.f_hz)),
                     float(given.get(f"DAMPING_RATIO_{axis}", s.damping)),
                 )
             )
