@@ -496,6 +496,27 @@ def test_a_key_does_where_the_browser_stores_nothing(guarded: Service, visitor: 
     expect(page.get_by_role("dialog")).to_contain_text("asks for a key")
 
 
+def test_a_stream_that_falls_silent_is_left(visitor: Visitor):
+    """As on a phone that came into another network: browsers may not notice for minutes."""
+    (example,) = JobView.model_config["json_schema_extra"]["examples"]
+    shares = iter([0.42, *[0.9] * 100])
+
+    def answer(route: Route) -> None:
+        job = example | {"progress": next(shares)}
+        route.fulfill(body=json.dumps(job), content_type="application/json")
+
+    page = visitor.open("#/")
+    page.clock.install()
+    page.route(re.compile(rf"/v1/jobs/{example['id']}$"), answer)
+    page.route("**/events", lambda _: None)
+    with page.expect_request("**/events"):
+        page.goto(f"{visitor.url}/#/jobs/{example['id']}")
+    panel = page.get_by_role("region", name="Progress")
+    expect(panel).to_contain_text("42 %")
+    page.clock.fast_forward(50_000)
+    expect(panel).to_contain_text("90 %")
+
+
 @pytest.mark.parametrize(
     ("job", "said"),
     [
