@@ -161,6 +161,7 @@ class Stillpath:
             await self._cancel(filename)
 
     def _ask(self, file: str, print_after: bool) -> dict[str, Any]:
+        file = file.strip("/")  # one file, one job
         try:
             return dict(self._enqueue(file, print_after, force=True))
         except Refused as error:
@@ -168,7 +169,7 @@ class Stillpath:
             raise self.server.error(str(error), 400) from None
 
     async def _cancel(self, file: str) -> dict[str, Any]:
-        job = self._jobs.get(file)
+        job = self._jobs.get(file.strip("/"))
         if job is None or job["state"] not in _WAITING:
             raise self.server.error(f"{file} is not being compensated", 404)
         running = job["state"] == "running"

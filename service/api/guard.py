@@ -133,12 +133,17 @@ def _has_body(scope: Scope) -> bool:
 
 def _foreign(method: str, host: str, headers: Headers) -> str | None:
     origin = headers.get("origin")
-    if method not in _SAFE:
-        if origin is None or _origin_host(origin) == host.lower():
-            return None
-        return f"The request comes from another site ({origin[:80]}). Use this service's own page."
-    # A "resource isolation policy": browsers say where a request comes from, and what for.
+    # Browsers say where a request comes from, and what for; no page can say so in their place.
     site, mode = headers.get("sec-fetch-site"), headers.get("sec-fetch-mode")
+    if method not in _SAFE:
+        # A proxy may have left the port out of the Host header, or put one in.
+        if origin is None or site == "same-origin" or _origin_host(origin) == host.lower():
+            return None
+        return (
+            f"The request comes from another site ({origin[:80]}) than {host[:80]}. Use this "
+            "service's own page; a proxy must pass the Host header on as it came, with the port."
+        )
+    # A "resource isolation policy".
     if site == "cross-site" and mode != "navigate":
         return "Another site's page tries to load this. Open it by itself."
     return None

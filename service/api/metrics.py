@@ -130,7 +130,8 @@ class Metrics(Collector):
         self._read_until = now - _SETTLED_S
         for job in ended:
             if job.started_at is not None and job.finished_at is not None:
-                self._job_seconds.labels(job.state.value).observe(job.finished_at - job.started_at)
+                seconds = max(job.finished_at - job.started_at, 0.0)  # the clock may be set back
+                self._job_seconds.labels(job.state.value).observe(seconds)
         jobs = GaugeMetricFamily("stillpath_jobs", "Jobs by state", labels=("state",))
         for state, count in counts.items():
             jobs.add_metric((state.value,), count)

@@ -16,14 +16,24 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
-from sqlalchemy import Engine, and_, case, or_, select, update
+from sqlalchemy import Engine, Select, and_, case, or_, select, update
 
 from stillpath.service.database.engine import reading, writing
 from stillpath.service.database.tables import deliveries, jobs
 from stillpath.service.jobs.state import Job
 
-__all__ = ["Delivery", "bring_forward", "claim", "deliveries_of", "overtaken", "prolong", "settle"]
+__all__ = [
+    "Delivery",
+    "bring_forward",
+    "claim",
+    "deliveries_of",
+    "is_behind",
+    "overtaken",
+    "prolong",
+    "settle",
+]
 
 _AT_ONCE = 500
 
@@ -107,7 +117,8 @@ def claim(engine: Engine, *, now: float, until: float) -> tuple[Delivery, bool] 
 def overtaken(engine: Engine, claimed: Delivery, job: Job) -> str | None:
     """Return how far a later job is that brings the same printer a file of the same name.
 
-    Later by its time and by its delivery's number: of a clock that was set back, one is wrong.
+    Later by its submission, and by its delivery's number unless it was done while this one waited
+    or ran: of a clock that was set back, one time is wrong.
 
     Returns
     -------
@@ -115,16 +126,35 @@ def overtaken(engine: Engine, claimed: Delivery, job: Job) -> str | None:
         ``done``, ``sending``, or None: there is no such job, or it is not being sent.
     """
     row = deliveries.c
+    outran = jobs.c.finished_at <= job.finished_at
     later = (
-        select(row.state)
-        .join(jobs, jobs.c.id == row.job_id)
-        .where(row.kind == "printer", row.target == claimed.target, row.id > claimed.id)
-        .where(row.state.in_(("done", "sending")))
-        .where(jobs.c.result_name == job.result_name, jobs.c.created_at > job.created_at)
+        _rivals(claimed, job)
+        .where(row.state.in_(("done", "sending")), jobs.c.created_at > job.created_at)
+        .where(or_(row.id > claimed.id, outran))
         .order_by(row.state)
     )
     with reading(engine) as connection:
         return connection.execute(later).scalars().first()
+
+
+def is_behind(engine: Engine, claimed: Delivery, job: Job, *, now: float) -> bool:
+    """Return whether an earlier job's file of the same name is on its way to the same printer."""
+    row = deliveries.c
+    sending = (row.state == "sending", row.next_at > now)
+    earlier = _rivals(claimed, job).where(*sending, jobs.c.created_at < job.created_at)
+    with reading(engine) as connection:
+        return connection.execute(earlier).first() is not None
+
+
+def _rivals(claimed: Delivery, job: Job) -> Select[Any]:
+    """Select the states of what else brings the same printer a file of the same name."""
+    row = deliveries.c
+    return (
+        select(row.state)
+        .join(jobs, jobs.c.id == row.job_id)
+        .where(row.kind == "printer", row.target == claimed.target, row.id != claimed.id)
+        .where(jobs.c.result_name == job.result_name)
+    )
 
 
 def bring_forward(engine: Engine, *, waiting: Sequence[float], sending: float) -> None:

@@ -233,6 +233,9 @@ class Sender:
         try:
             if claimed.kind == "webhook":
                 return _judged(self._send_webhook(claimed, job))
+            while rows.is_behind(self._engine, claimed, job, now=time.time()):
+                if self._stopping.wait(self._times.poll_s):
+                    return "waiting", f"an earlier {job.result_name} is on its way"
             later = rows.overtaken(self._engine, claimed, job)
             if later is not None:
                 return _outdated(claimed, job, later)

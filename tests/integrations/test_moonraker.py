@@ -303,7 +303,7 @@ def test_what_is_told_late_is_no_second_wish(tmp_path: Path):
         server.upload("b.gcode", PART)
         await server.from_macro("stillpath_process", filename="b.gcode", print_after=0)
         (server.gcodes / "c.gcode").write_text(PART)
-        await server.from_macro("stillpath_process", filename="c.gcode")
+        await server.from_macro("stillpath_process", filename="/c.gcode")
         await server.from_macro("stillpath_cancel", filename="c.gcode")
         server.upload("c.gcode", PART, changed=False)
         assert [(await settled(server, f"{n}.gcode"))["state"] for n in "abc"] == [

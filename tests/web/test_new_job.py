@@ -30,6 +30,15 @@ Object.defineProperty(window, "sessionStorage", {
 });
 """
 
+# What a browser tells of a request that the test keeps.
+ALL_SENT = """
+const send = XMLHttpRequest.prototype.send;
+XMLHttpRequest.prototype.send = function (body) {
+  send.call(this, body);
+  this.upload.dispatchEvent(new ProgressEvent("progress", { loaded: 1, total: 1 }));
+};
+"""
+
 
 def choose_machine(page: Page, typed: str) -> None:
     field = page.get_by_role("combobox", name="Machine")
@@ -161,10 +170,19 @@ def test_a_wrong_value_that_is_folded_away_is_shown(visitor: Visitor, tmp_path: 
     expect(page.get_by_label("Speed budget, µm")).to_be_focused()
 
 
-def test_leaving_an_upload_is_told(visitor: Visitor, tmp_path: Path):
+@pytest.mark.parametrize(
+    ("script", "said", "choice", "heading"),
+    [
+        ("", "was on its way", "Choose it again", "New job"),
+        (ALL_SENT, "was being stored", "Show the jobs", "Jobs"),
+    ],
+)
+def test_leaving_an_upload_is_told(
+    visitor: Visitor, tmp_path: Path, script: str, said: str, choice: str, heading: str
+):
     file = tmp_path / "part.gcode"
     file.write_bytes(PART)
-    page = visitor.open()
+    page = visitor.open(script=script)
     # Sent, and never answered.
     page.route(
         "**/v1/jobs?*", lambda route: None if route.request.method == "POST" else route.continue_()
@@ -175,11 +193,11 @@ def test_leaving_an_upload_is_told(visitor: Visitor, tmp_path: Path):
         page.evaluate("setTimeout(() => location.reload())")
     assert question.value.type == "beforeunload"
     question.value.dismiss()
-    page.get_by_role("link", name="Jobs", exact=True).first.click()
+    page.get_by_role("link", name="Machines", exact=True).first.click()
     dialog = page.get_by_role("dialog")
-    expect(dialog).to_contain_text("part.gcode")
-    dialog.get_by_role("button", name="Choose it again").click()
-    expect(page.locator("h1")).to_have_text("New job")
+    expect(dialog).to_contain_text(f"part.gcode {said}")
+    dialog.get_by_role("button", name=choice).click()
+    expect(page.locator("h1")).to_have_text(heading)
     page.reload()  # asks nothing any more
 
 
@@ -304,9 +322,21 @@ def test_the_list_has_pages_and_states(visitor: Visitor, service: Service, gear:
     page = visitor.open("#/jobs")
     rows = page.locator(".job-row")
     expect(rows).to_have_count(25)
-    page.get_by_role("button", name="Older").click()
+    first_page = re.compile(r"/v1/jobs\?limit=25$")
+    slow: list[Route] = []
+
+    def hold(route: Route) -> None:
+        slow.append(route)
+
+    with page.expect_request(first_page):
+        page.route(first_page, hold, times=1)
+    page.get_by_role("button", name="Older").dblclick()
     expect(page.get_by_role("button", name="Newer")).to_be_enabled()
     expect(page.get_by_role("link", name="part00.gcode")).to_be_visible()
+    with page.expect_response(first_page):
+        slow[0].continue_()
+    page.wait_for_timeout(300)
+    assert page.get_by_role("link", name="part00.gcode").is_visible()
     page.get_by_role("button", name="Newer").click()
     expect(page.get_by_role("link", name="part27.gcode")).to_be_visible()
     page.get_by_role("button", name="Done", exact=True).click()
@@ -341,15 +371,20 @@ def test_list_page_and_report_say_the_same(
 
 
 def test_a_job_says_what_became_of_its_delivery(visitor: Visitor, gear: dict[str, Any]):
-    """Done is not started: the printer may have refused it."""
+    """Done is not started: the printer may have refused it. One answer is lost on its way."""
+    visitor.expected = {"ERR_FAILED"}
     sending = {"kind": "printer", "target": "left", "state": "sending", "attempts": 1}
     refused = sending | {"state": "failed", "error": "File is loaded; send it again"}
-    after = iter([sending | {"error": None}, refused])
+    after = iter([sending | {"error": None}, None, refused])
 
     def answer(route: Route) -> None:
         job = gear | {"printer": "left", "print": True}
-        job["deliveries"] = [next(after) | {"next_at": None}] if shown else []
+        delivery = next(after) if shown else {}
         shown.append(job)
+        if delivery is None:
+            route.abort()
+            return
+        job["deliveries"] = [delivery | {"next_at": None}] if delivery else []
         route.fulfill(body=json.dumps(job), content_type="application/json")
 
     shown: list[Any] = []
@@ -359,7 +394,7 @@ def test_a_job_says_what_became_of_its_delivery(visitor: Visitor, gear: dict[str
     sent = page.get_by_role("list", name="Sent on")
     expect(sent).to_have_text("Sending to the printer left failed: File is loaded; send it again")
     expect(page.locator(".headline")).to_be_visible()
-    assert len(shown) == 3
+    assert len(shown) == 4
 
 
 def test_a_job_that_is_not_there(visitor: Visitor):
@@ -392,6 +427,9 @@ def test_a_key_is_asked_for_and_goes_along(guarded: Service, visitor: Visitor, t
     expect(dialog).to_contain_text("asks for a key")
     visitor.shoot(page, "key")
     expect(page.get_by_label("Key", exact=True)).to_be_focused()
+    page.get_by_label("Key", exact=True).fill("sp_01…")  # as a narrow table shows it
+    page.get_by_role("button", name="Use this key").click()
+    expect(page.locator("#key:invalid")).to_be_visible()
     page.get_by_label("Key", exact=True).fill("sp_" + "wrong" * 8)
     page.get_by_role("button", name="Use this key").click()
     expect(dialog).to_contain_text("asks for a key")
@@ -408,6 +446,28 @@ def test_a_key_is_asked_for_and_goes_along(guarded: Service, visitor: Visitor, t
     assert KEY not in page.evaluate("JSON.stringify({...localStorage}) + document.cookie")
     page.get_by_role("button", name="Forget key").click()
     expect(page.get_by_role("dialog")).to_contain_text("asks for a key")
+
+
+def test_a_key_that_comes_late_sends_nothing(guarded: Service, visitor: Visitor, tmp_path: Path):
+    """The upload was left meanwhile, by going back."""
+    file = tmp_path / "left.gcode"
+    file.write_bytes(PART)
+    visitor.expected = {401}
+    page = visitor.open(at=guarded.url)
+    page.get_by_label("Key", exact=True).fill(KEY)
+    page.get_by_role("button", name="Use this key").click()
+    page.route(
+        re.compile(r"/v1/jobs\?machine"),
+        lambda route: route.fulfill(status=401, body='{"detail": "It was revoked."}'),
+        times=1,
+    )
+    hand_in(page, file)
+    expect(page.get_by_role("dialog")).to_contain_text("It was revoked.")
+    page.evaluate("location.hash = '#/jobs'")
+    page.get_by_label("Key", exact=True).fill(KEY)
+    page.get_by_role("button", name="Use this key").click()
+    expect(page.get_by_role("dialog")).to_contain_text("left.gcode was on its way")
+    assert "left.gcode" not in guarded.api.get("/v1/jobs").text
 
 
 @pytest.mark.parametrize("view", ["#/", "#/jobs"])
@@ -434,6 +494,27 @@ def test_a_key_does_where_the_browser_stores_nothing(guarded: Service, visitor: 
     expect(page.get_by_role("combobox", name="Machine")).to_be_enabled()
     page.get_by_role("button", name="Forget key").click()
     expect(page.get_by_role("dialog")).to_contain_text("asks for a key")
+
+
+def test_a_stream_that_falls_silent_is_left(visitor: Visitor):
+    """As on a phone that came into another network: browsers may not notice for minutes."""
+    (example,) = JobView.model_config["json_schema_extra"]["examples"]
+    shares = iter([0.42, *[0.9] * 100])
+
+    def answer(route: Route) -> None:
+        job = example | {"progress": next(shares)}
+        route.fulfill(body=json.dumps(job), content_type="application/json")
+
+    page = visitor.open("#/")
+    page.clock.install()
+    page.route(re.compile(rf"/v1/jobs/{example['id']}$"), answer)
+    page.route("**/events", lambda _: None)
+    with page.expect_request("**/events"):
+        page.goto(f"{visitor.url}/#/jobs/{example['id']}")
+    panel = page.get_by_role("region", name="Progress")
+    expect(panel).to_contain_text("42 %")
+    page.clock.fast_forward(50_000)
+    expect(panel).to_contain_text("90 %")
 
 
 @pytest.mark.parametrize(

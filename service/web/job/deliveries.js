@@ -19,15 +19,26 @@ export async function showDeliveries(panel, job, signal) {
   if (!job.printer && !job.webhook) return;
   try {
     for (let wait = ASK_AFTER_MS; ; wait = Math.min(1.5 * wait, SLOWEST_MS)) {
-      // Events of a job come without its deliveries.
-      const { deliveries } = await getJson(`/v1/jobs/${job.id}`, { signal });
-      fill(panel, deliveries.length ? h("ul.notice", { "aria-label": "Sent on" },
-        deliveries.map((/** @type {any} */ each) => h("li", null, sentence(job, each)))) : null);
-      if (deliveries.every((/** @type {any} */ each) => ["done", "failed"].includes(each.state))) return;
+      if (await isSettled(panel, job, signal)) return;
       await pause(wait, signal);
     }
   } catch (error) {
     if (!isAbort(error)) fill(panel, problemPanel(error));
+  }
+}
+
+/** Show how it stands now. @param {Element} panel @param {any} job @param {AbortSignal} signal @returns {Promise<boolean>} */
+async function isSettled(panel, job, signal) {
+  try {
+    // Events of a job come without its deliveries.
+    const { deliveries } = await getJson(`/v1/jobs/${job.id}`, { signal });
+    fill(panel, deliveries.length ? h("ul.notice", { "aria-label": "Sent on" },
+      deliveries.map((/** @type {any} */ each) => h("li", null, sentence(job, each)))) : null);
+    return deliveries.every((/** @type {any} */ each) => ["done", "failed"].includes(each.state));
+  } catch (/** @type {any} */ error) {
+    if (isAbort(error) || [401, 403, 404].includes(error.status)) throw error;
+    fill(panel, h("p.hint", null, "The service does not answer; it is asked again until it does."));
+    return false;
   }
 }
 

@@ -159,6 +159,7 @@ async function send(path, { method = "GET", query, body, headers, signal }) {
  */
 function post(url, body, onProgress, signal) {
   return new Promise((resolve, reject) => {
+    signal.throwIfAborted(); // the page may have been left while a key was asked for
     const sending = new XMLHttpRequest();
     sending.open("POST", url);
     sending.setRequestHeader("Content-Type", "application/octet-stream");

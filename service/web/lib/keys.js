@@ -62,6 +62,8 @@ function ask({ title, detail }) {
     const field = h("input", {
       type: "password", id: "key", name: "key", autocomplete: "off", spellcheck: "false",
       required: true, placeholder: "sp_…", "aria-describedby": "key-reason",
+      // No header holds other characters: no request could be sent any more.
+      pattern: "\\s*[!-~]+\\s*", title: "Letters, digits, - and _; copy the whole key again",
     });
     const dialog = h("dialog.ask", { "aria-labelledby": "key-title" },
       h("form", { method: "dialog", onsubmit: () => {

@@ -1,11 +1,13 @@
 /** Follows a job: by the service's stream of events, or by asking while there is none. */
 
-import { getJson, isAbort, request } from "./api.js";
+import { getJson, request } from "./api.js";
 import { ProblemError } from "./problem.js";
 
 const FINAL = new Set(["done", "failed", "cancelled"]);
 const ASK_EVERY_MS = 1000;
 const SLOWEST_MS = 15_000;
+/** The stream says every 15 s that it is there; of a broken connection browsers may not tell for minutes. */
+const QUIET_MS = 45_000;
 
 /**
  * @param {{state: string}} job
@@ -35,10 +37,10 @@ export async function watchJob(id, onJob, signal, onSilence = () => {}) {
   };
   while (!over) {
     try {
-      if (streams) await follow(id, note, signal);
+      if (streams) await whileHeard(signal, (still, heard) => follow(id, note, still, heard));
       else note(await getJson(`/v1/jobs/${id}`, { signal }));
     } catch (error) {
-      if (isAbort(error) || signal.aborted) throw error;
+      if (signal.aborted) throw error;
       if (error instanceof ProblemError && [401, 403, 404].includes(error.status) && !streams) throw error;
       if (!streams) onSilence();
       streams = false;
@@ -49,13 +51,35 @@ export async function watchJob(id, onJob, signal, onSilence = () => {}) {
 }
 
 /**
+ * Give something up that is silent for too long.
+ *
+ * @param {AbortSignal} signal
+ * @param {(still: AbortSignal, heard: () => void) => Promise<void>} listen
+ */
+async function whileHeard(signal, listen) {
+  const quiet = new AbortController();
+  let timer = 0;
+  const heard = () => {
+    clearTimeout(timer);
+    timer = setTimeout(() => quiet.abort(), QUIET_MS);
+  };
+  heard();
+  try {
+    await listen(AbortSignal.any([signal, quiet.signal]), heard);
+  } finally {
+    clearTimeout(timer);
+  }
+}
+
+/**
  * Read `text/event-stream` (WHATWG HTML, 9.2) as far as jobs need it.
  *
  * @param {string} id
  * @param {(job: any) => void} onJob
  * @param {AbortSignal} signal
+ * @param {() => void} heard Called with whatever comes.
  */
-async function follow(id, onJob, signal) {
+async function follow(id, onJob, signal, heard) {
   const answer = await request(`/v1/jobs/${id}/events`, {
     headers: { Accept: "text/event-stream" }, signal,
   });
@@ -64,6 +88,7 @@ async function follow(id, onJob, signal) {
   let text = "";
   for (;;) {
     const { value, done } = await reader.read();
+    heard();
     if (done) return;
     text += value.replaceAll("\r\n", "\n").replaceAll("\r", "\n");
     const events = text.split("\n\n");

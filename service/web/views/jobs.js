@@ -38,14 +38,20 @@ export async function show({ main, signal, setTitle }) {
   fill(main, h("div.head", null, h("h1", null, "Jobs"), h("a.button.main.end", { href: "#/" }, "New job")), h("div.filter", null, filter), fault, list, pager);
 
   async function reload(tells = false, ask = true) {
+    const cursor = cursors.at(-1);
+    const wanted = state;
+    // Another page or state may have been chosen before the answer comes.
+    const isPast = () => cursor !== cursors.at(-1) || wanted !== state;
     try {
-      page = await getJson("/v1/jobs", { query: { state, limit: PAGE, cursor: cursors.at(-1) }, signal, ask });
+      const found = await getJson("/v1/jobs", { query: { state, limit: PAGE, cursor }, signal, ask });
+      if (isPast()) return;
+      page = found;
       lacksKey = false;
       fill(fault);
       draw();
       if (tells) announce(page.jobs.length ? `${page.jobs.length} jobs on this page` : "No jobs");
     } catch (/** @type {any} */ error) {
-      if (isAbort(error)) return;
+      if (isAbort(error) || isPast()) return;
       lacksKey = error.status === 401;
       fill(fault, lacksKey ? retryPanel(error, () => reload(true)) : problemPanel(error));
     }
@@ -58,11 +64,11 @@ export async function show({ main, signal, setTitle }) {
       : h("p.empty", null, state ? "No jobs are in this state." : "No jobs yet."));
     fill(pager,
       h("button", { type: "button", disabled: cursors.length < 2, onclick: () => {
-        cursors.pop();
+        if (cursors.length > 1) cursors.pop();
         reload(true);
       } }, "Newer"),
       h("button", { type: "button", disabled: !page.next, onclick: () => {
-        cursors.push(page.next);
+        if (cursors.at(-1) !== page.next) cursors.push(page.next); // again, where that page did not come
         reload(true);
       } }, "Older"));
     pager.hidden = cursors.length < 2 && !page.next;

@@ -93,6 +93,7 @@ export async function show({ main, signal, setTitle }) {
     const bar = h("progress", { max: "1", value: "0", "aria-label": "Sent" });
     const text = h("span", null, "Sending …");
     const name = file.name;
+    let isWhole = false;
     const warn = (/** @type {Event} */ event) => event.preventDefault();
     addEventListener("beforeunload", warn);
     send.disabled = true;
@@ -103,12 +104,14 @@ export async function show({ main, signal, setTitle }) {
         : { machine, method: method.value, tolerance_um: tolerance.value, name, ...options.read(), compare_live: compares() };
       const job = await upload("/v1/jobs", query, file, (share) => {
         bar.value = share;
+        isWhole = share === 1;
         fill(text, share < 1 ? `Sending: ${Math.floor(100 * share)} % of ${bytes(file?.size)}` : "Received; being stored …");
       }, sending.signal);
       location.hash = `#/jobs/${job.id}`;
     } catch (error) {
-      if (signal.aborted) return notSent(name);
-      fill(status, isAbort(error) ? h("p.hint", null, "Not sent.") : problemPanel(error));
+      if (signal.aborted) return notSent(name, isWhole);
+      const stopped = isWhole ? "All of it had been sent: see whether it is among the jobs." : "Not sent.";
+      fill(status, isAbort(error) ? h("p.hint", null, stopped) : problemPanel(error));
       ready();
     } finally {
       removeEventListener("beforeunload", warn);
@@ -116,11 +119,12 @@ export async function show({ main, signal, setTitle }) {
   }
 }
 
-/** Tell that leaving the page ended an upload. @param {string} name */
-async function notSent(name) {
-  const text = `You left the page while ${name} was on its way.`;
-  const again = await confirmed({ title: "The file was not sent", text, yes: "Choose it again", no: "Leave it", danger: false });
-  if (again) location.hash = "#/";
+/** Tell that leaving the page ended an upload. @param {string} name @param {boolean} isWhole The service may have it. */
+async function notSent(name, isWhole) {
+  const yes = await confirmed({ no: "Leave it", danger: false, ...(isWhole
+    ? { title: "The file may have been taken", text: `You left the page while ${name} was being stored. See whether it is among the jobs.`, yes: "Show the jobs" }
+    : { title: "The file was not sent", text: `You left the page while ${name} was on its way.`, yes: "Choose it again" }) });
+  if (yes) location.hash = isWhole ? "#/jobs" : "#/";
 }
 
 /** What can be told of a file without sending it. @param {File} file @returns {{title: string, detail: string} | null} */

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from datetime import datetime
 from pathlib import Path
@@ -11,9 +12,13 @@ from typing import Any
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from stillpath.service.database.engine import DatabaseAway
+from stillpath.service.api.metrics import Metrics
+from stillpath.service.database.engine import DatabaseAway, open_database
+from stillpath.service.jobs.store import JobStore
+from stillpath.service.settings import Settings
 from stillpath.service.storage.base import StorageError
 from tests.service.api.serving import opened, post
+from tests.service.database.examples import finished, make_job
 from tests.service.test_api import assert_problem, over, until
 
 _ENDS = ("started", "finished")
@@ -74,6 +79,26 @@ def test_how_long_jobs_took(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
                     assert found[f"{name}_bucket", bucket] == within
                 bucket = frozenset(labels | {("le", "+Inf")})
                 assert found[f"{name}_bucket", bucket] == len(expected)
+
+
+def test_a_clock_that_is_set_back_takes_nothing_off(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """A sum that falls is a restart to Prometheus."""
+    monkeypatch.setattr("stillpath.service.api.metrics._SETTLED_S", 0.0)
+    engine = open_database(Settings(data_dir=tmp_path))
+    store = JobStore(engine)
+    metrics = Metrics(lambda: store, lambda: None, lambda: 0)
+    job = make_job()
+    store.add(job)
+    running = store.claim(job.id, time.time() + 100, "worker")
+    assert running is not None
+    assert store.apply(job.id, finished(running, at=time.time())) is not None
+    found = figures(metrics.exposition().decode())
+    engine.dispose()
+    done = frozenset({("state", "done")})
+    assert found["stillpath_job_seconds_count", done] == 1
+    assert found["stillpath_job_seconds_sum", done] == 0
 
 
 def seconds_of(job: dict[str, Any]) -> float:

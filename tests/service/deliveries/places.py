@@ -56,7 +56,7 @@ class Place:
         finally:
             sender.stop()
 
-    def finish(self, folder: Path, **fields: Any) -> Job:
+    def finish(self, folder: Path, *, finished_at: float | None = None, **fields: Any) -> Job:
         """Return a job that was added and is done, with its result in the storage."""
         job = make_job(**fields)
         self.store.add(job)
@@ -68,7 +68,8 @@ class Place:
         file.write_bytes(RESULT)
         self.storage.put(f"{output}/result/{job.result_name}", file)
         digest = hashlib.sha256(RESULT).hexdigest()
-        event = Finished(1, time.time(), output, len(RESULT), len(RESULT), digest, {"after_um": 1})
+        size, at = len(RESULT), finished_at or time.time()
+        event = Finished(1, at, output, size, size, digest, {"after_um": 1})
         done = self.store.apply(job.id, event)
         assert done is not None
         return done

@@ -97,7 +97,8 @@ def test_a_late_upload_replaces_no_later_file(tmp_path: Path):
         assert settle(place.engine, of_earlier, "waiting", next_at=0.0)
         others = [
             place.finish(tmp_path, printer="p", created_at=1000.0, result_name="other.gcode"),
-            place.finish(tmp_path, printer="p", created_at=500.0),  # the clock was set back
+            # The clock was set back.
+            place.finish(tmp_path, printer="p", created_at=500.0, finished_at=600.0),
         ]
         with place.sending():
             until(lambda: place.delivery(earlier).error)
@@ -105,10 +106,28 @@ def test_a_late_upload_replaces_no_later_file(tmp_path: Path):
             assert [place.settled(job).state for job in others] == ["done", "done"]
             assert settle(place.engine, of_later, "waiting", next_at=0.0)
             assert place.settled(later).state == "done"
-            delivery = place.settled(earlier)
-    assert delivery.state == "failed"
-    assert "has a later part.stillpath.gcode already" in (delivery.error or "")
+            slow = place.finish(tmp_path, printer="p", created_at=1500.0)  # the later outran it
+            found = [place.settled(job) for job in (earlier, slow)]
+    for delivery in found:
+        assert delivery.state == "failed"
+        assert "has a later part.stillpath.gcode already" in (delivery.error or "")
     assert len(uploads(server)) == 3
+
+
+def test_a_later_upload_waits_for_an_earlier_one_on_its_way(tmp_path: Path):
+    """Side by side the earlier one, if it is larger, would arrive last and stay."""
+    with moonraker() as server, at(tmp_path, printer("p", "moonraker", server.url)) as place:
+        place.finish(tmp_path, printer="p", created_at=1000.0)
+        claimed = claim(place.engine, now=time.time(), until=time.time() + 60)
+        assert claimed is not None
+        later = place.finish(tmp_path, printer="p", created_at=2000.0)
+        other = place.finish(tmp_path, printer="p", result_name="other.gcode")
+        with place.sending():
+            assert place.settled(other).state == "done"
+            assert (place.delivery(later).state, len(uploads(server))) == ("sending", 1)
+            assert settle(place.engine, claimed[0], "done", next_at=0.0)
+            assert place.settled(later).state == "done"
+    assert len(uploads(server)) == 2
 
 
 def test_a_wrong_key_is_told_and_not_repeated(tmp_path: Path):

@@ -84,23 +84,31 @@ def test_which_names_are_answered(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("origin", "status"),
+    ("origin", "site", "status"),
     [
-        (None, 200),
-        ("http://localhost:8000", 200),
-        ("http://localhost:9000", 403),
-        ("http://evil.example", 403),
-        ("null", 403),
-        ("http://localhost:8000.evil.example", 403),
-        ("http://[::1", 403),
+        (None, None, 200),
+        ("http://localhost:8000", None, 200),
+        ("http://localhost:9000", None, 403),
+        ("http://localhost:9000", "same-origin", 200),  # a proxy that leaves the port out
+        ("http://localhost:9000", "same-site", 403),
+        ("http://evil.example", None, 403),
+        ("http://evil.example", "cross-site", 403),
+        ("null", None, 403),
+        ("http://localhost:8000.evil.example", None, 403),
+        ("http://[::1", None, 403),
     ],
 )
-def test_changes_come_from_our_own_page(origin: str | None, status: int):
-    headers = {} if origin is None else {"Origin": origin}
+def test_changes_come_from_our_own_page(origin: str | None, site: str | None, status: int):
+    given = {"Origin": origin, "Sec-Fetch-Site": site}
+    headers = {name: value for name, value in given.items() if value is not None}
     client = open_client()
-    assert client.post("/x", headers=headers).status_code == status
+    answer = client.post("/x", headers=headers)
+    assert answer.status_code == status
+    if status == 403:
+        assert "Host header" in answer.json()["detail"]
     assert client.delete("/x", headers=headers).status_code == status
-    assert client.get("/x", headers=headers).status_code == 200
+    if site != "cross-site":
+        assert client.get("/x", headers=headers).status_code == 200
 
 
 @pytest.mark.parametrize(
