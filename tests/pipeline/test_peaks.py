@@ -1,10 +1,11 @@
-"""Passes over a command, and over its moves, against numpy."""
+"""Passes over a command, over its moves, and over measured motion, against numpy."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
+from stillpath.pipeline.measuring._maxima_kernels import above, ringing
 from stillpath.pipeline.measuring._peak_kernels import peaks, speed_step
 
 
@@ -35,3 +36,37 @@ def test_speed_step(n: int, mean: bool, corexy: bool) -> None:
         rounding = 2.0 * rounding
     steps = np.abs(np.diff(velocity, axis=0)).max(axis=1) - rounding[1:] - rounding[:-1]
     assert found == pytest.approx(np.max(steps, initial=0.0), rel=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_samples_behind_the_ends_of_lines(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    n, reach, still_mm = 200, int(rng.integers(1, 30)), 1e-9
+    moves = np.repeat(rng.random(40) < 0.4, 5)
+    path = np.cumsum(np.where(moves, rng.choice([0.0, 1e-3, -0.1], (2, n)), 0.0), axis=1)
+    extruding = moves & np.repeat(rng.random(20) < 0.5, 10)
+    before, (printed, moved) = path[:, 0] - [0.0, 0.1 * (seed % 2)], -rng.integers(1, 40, 2)
+    found = np.empty((2, n), np.int64)
+    count, *last = ringing(path, extruding, before, still_mm, reach, printed, moved, found)
+
+    here, step = np.arange(n), np.abs(np.diff(path, axis=1, prepend=before[:, None]))
+    line = np.maximum.accumulate(np.where(extruding, here, printed))
+    since = np.maximum.accumulate(np.where(np.any(step > still_mm, axis=0), here, moved))
+    chosen = ~extruding & (here - line <= reach) & (since <= line + 1)
+    np.testing.assert_array_equal(found[:, :count], [here[chosen], line[chosen]])
+    assert last == [line[-1], since[-1]]
+
+
+@pytest.mark.parametrize("features", [0, 1, 4])
+def test_samples_above_the_largest_of_their_feature(features: int) -> None:
+    rng = np.random.default_rng(features)
+    path, answer = rng.normal(size=(2, 2, 300))
+    feature = rng.integers(-2, 4, 300).astype(np.int32)
+    most = rng.uniform(0.5, 2.0, features)
+    chosen = np.empty(300, np.int64)
+    count = above(path, answer, feature, most, chosen)
+    limit = np.append(most, np.zeros(5 - features))[feature + 1]
+    distance = np.hypot(*(answer - path))
+    np.testing.assert_array_equal(
+        chosen[:count], np.flatnonzero((feature >= -1) & (distance > limit))
+    )
