@@ -103,8 +103,8 @@ def build_timeline(
     rest_s: NDArray[np.float64],
     dt_s: float,
     *,
-    lead_s: float = 0.0,
-    tail_s: float = 0.0,
+    lead_s: NDArray[np.float64] | float = 0.0,
+    tail_s: NDArray[np.float64] | float = 0.0,
 ) -> Timeline:
     """Lay a piece on the sampling grid.
 
@@ -116,10 +116,11 @@ def build_timeline(
         As `group_rows` gives them.
     rest_s : ndarray, shape (len(groups),)
         Duration of each rest under the limits of the written file (ignored for stretches).
-    lead_s, tail_s : float
-        Standing time before and after every stretch, for compensators that need it.
+    lead_s, tail_s : float, or ndarray, shape (len(groups),)
+        Standing time before and after every stretch, or each of them (ignored for rests).
     """
     duration = phases.lasts_s
+    lead_s, tail_s = (np.broadcast_to(one, len(groups)) for one in (lead_s, tail_s))
     start, end, row_start, rests = _laid(groups, duration, rest_s, dt_s, lead_s, tail_s)
     samples = int(np.ceil(end[-1] / dt_s - _GRID_EPS)) + 1
     moved = replace(phases, t_s=row_start)
@@ -144,8 +145,8 @@ def _laid(
     duration: NDArray[np.float64],
     rest_s: NDArray[np.float64],
     dt_s: float,
-    lead_s: float,
-    tail_s: float,
+    lead_s: NDArray[np.float64],
+    tail_s: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], list[tuple[int, int]]]:
     """Return start and end of the groups, the start of the rows, and the samples of the rests."""
     row_start = np.empty(len(duration))
@@ -167,8 +168,8 @@ def _laid(
             now = end[i]
         else:
             start[i] = now
-            row_start[rows] = now + lead_s + offset[:-1]
-            now = dt_s * np.ceil((now + lead_s + offset[-1] + tail_s) / dt_s - _GRID_EPS)
+            row_start[rows] = now + lead_s[i] + offset[:-1]
+            now = dt_s * np.ceil((now + lead_s[i] + offset[-1] + tail_s[i]) / dt_s - _GRID_EPS)
             # A stretch has at least one sample of its own after the rest.
             now = max(now, dt_s * (rests[-1][1] if rests else 1))
             end[i] = now

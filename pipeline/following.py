@@ -34,6 +34,7 @@ def strayed(
     tolerance_mm: float,
     *,
     briefly: bool = False,
+    drift_mm: NDArray[np.float64] | float = 0.0,
 ) -> str | None:
     """Return a message if motion is too far from its command; else None.
 
@@ -46,7 +47,10 @@ def strayed(
         From `follow_tolerance_mm`.
     briefly : bool
         Allow twice the distance while extruding, for some hundredths of a second.
+    drift_mm : float, or ndarray, shape (n,)
+        Distance that does not count, as the motion is only early or late by it.
     """
+    gap_mm = np.maximum(gap_mm - drift_mm, 0.0)
     worst = float(np.max(gap_mm, initial=0.0))
     most_mm = tolerance_mm + _EXTRUDING_EXCESS_MM
     if worst <= most_mm:

@@ -19,7 +19,7 @@ from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.pieces import Piece
 from stillpath.gcode.sampler import distances, sample_phases, sample_until
 from stillpath.gcode.segments import ErrorFilter, Segments, fit_segments
-from stillpath.gcode.timeline import Timeline, build_timeline, group_rows
+from stillpath.gcode.timeline import Group, Timeline, build_timeline, group_rows
 from stillpath.gcode.types import Phases
 from stillpath.models.machine import Machine
 from stillpath.models.operating import OperatingGrid, machine_at
@@ -31,6 +31,7 @@ from stillpath.pipeline.following import follow_tolerance_mm, strayed
 from stillpath.pipeline.measuring._peak_kernels import peaks, speed_step
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.pipeline.options import COARSE_UM, Options
+from stillpath.pipeline.standing import Standing
 
 __all__ = [
     "DT_S",
@@ -115,6 +116,9 @@ class PieceCompensator:
         self._step_mm = firmware.step_mm
         self._follow_mm = follow_tolerance_mm(firmware, options.tolerance_um)
         self._filter = _error_filter(machine)
+        # A shaper ends after the plan by itself.
+        ends_with_plan = options.vibration == "fbf" and not self.compensator.tail_s
+        self._standing = Standing(machine, DT_S) if ends_with_plan else None
         command = machine.command
         steps = [command.of(axis).speed_step_mm_s for axis in ("x", "y")]
         # One limit serves both axes: the motion of an axis with a higher limit is scaled down.
@@ -177,7 +181,10 @@ class PieceCompensator:
         if level != self._level:
             self._level = level
             nodes = self._grid.at_level(level)
-            self._filter = _error_filter(machine_at(self._machine, nodes[len(nodes) // 2]))
+            here = machine_at(self._machine, nodes[len(nodes) // 2])
+            self._filter = _error_filter(here)
+            if self._standing is not None:
+                self._standing = Standing(here, DT_S)
 
     def _compensate(
         self, piece: Piece, soft_s: float = 0.0, *, briefly: bool = False
@@ -191,16 +198,10 @@ class PieceCompensator:
         resting = np.array([group.rest for group in groups])
         rest_s = self.encoder.rest_durations(piece, groups)
         feeds = phases.direction[:, 3] > 0.0
+        lead_s, tail_s = self._standing_s(phases, groups, soft_s)
         # The duration of a rest depends slightly on the speeds around it: iterate until consistent.
         for _ in range(_ROUNDS):
-            timeline = build_timeline(
-                phases,
-                groups,
-                rest_s,
-                DT_S,
-                lead_s=self.compensator.lead_s + soft_s,
-                tail_s=self.compensator.tail_s + soft_s,
-            )
+            timeline = build_timeline(phases, groups, rest_s, DT_S, lead_s=lead_s, tail_s=tail_s)
             extruding = timeline.moving & feeds[timeline.row]
             path = timeline.position_mm
             wanted = _mean(path[:2], round(soft_s / DT_S))
@@ -226,6 +227,17 @@ class PieceCompensator:
         if reason is not None:
             raise _Sudden(f"planned by the firmware's rules, {reason}{self._too_slow()}")
         return made
+
+    def _standing_s(
+        self, phases: Phases, groups: list[Group], soft_s: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the standing time before and after each group."""
+        made = self.compensator
+        lead_s, tail_s = (np.full(len(groups), one + soft_s) for one in (made.lead_s, made.tail_s))
+        if self._standing is None:
+            return lead_s, tail_s
+        begin_s, end_s = self._standing.of(phases, groups)
+        return lead_s + begin_s, tail_s + end_s
 
     def _too_slow(self) -> str:
         """Return what to do where Marlin, with few moves in its queue, stays below their speed."""

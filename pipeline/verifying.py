@@ -25,6 +25,8 @@ NEGLIGIBLE_UM = 1.0
 """Invisible contour error: below it, which of two is smaller does not matter."""
 
 _TIME_EXCESS_S = 20e-3
+_DRIFT_S = 0.25e-3
+"""A minute without a rest ends as much early or late: encoders expect where the firmware brakes."""
 _END_MM = np.array([1e-6, 1e-6, 1e-6, 1e-4])
 """Largest distance between the ends of a piece and its original, x y z e, beyond a motor step."""
 _STRIDE = 6
@@ -63,7 +65,11 @@ class Verifier:
         Unfit
             With the reason.
         """
-        reason = strayed(gap_mm, made.extruding, self._tolerance_mm, briefly=True)
+        step_mm = np.diff(made.command_mm[:2], axis=1, append=made.command_mm[:2, -1:])
+        drift_mm = _DRIFT_S / DT_S * np.hypot(*step_mm)
+        reason = strayed(
+            gap_mm, made.extruding, self._tolerance_mm, briefly=True, drift_mm=drift_mm
+        )
         if reason is not None:
             raise Unfit(f"read back, {reason}")
         timeline, begins_s = made.timeline, float(made.timeline.start_s[0])
