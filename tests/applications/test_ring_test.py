@@ -193,6 +193,25 @@ def test_a_machine_like_its_plants_is_confirmed(told: RingReport, log: Path) -> 
         assert found.tested_on == TODAY
 
 
+def test_friction_that_is_known_counts_in_what_is_predicted(
+    machine: Machine, told: RingReport, cache: Path, tmp_path: Path
+) -> None:
+    """What the command adds against it does not ring."""
+    true = {axis: replace(chain, friction_n=1.0) for axis, chain in TRUE.items()}
+    held_mm = {"x": 0.0193, "y": 0.0315}
+    axes = {a: p.model_copy(update={"friction_mm": held_mm[a]}) for a, p in machine.axes.items()}
+    rubbing = machine.model_copy(update={"axes": axes})
+    ring = tmp_path / "ring.gcode"
+    write_ring_test(rubbing, ring, cache_dir=cache)
+    content = recorded(ring, rubbing, true).raw_data()
+    report = said_of(tmp_path / "a.csv", ring, rubbing, content)
+    for axis, smooth in zip(report.axes, told.axes, strict=True):
+        assert axis.compensated is not None
+        assert smooth.compensated is not None
+        wanted = pytest.approx(smooth.compensated.predicted_um, rel=0.3)
+        assert axis.compensated.predicted_um == wanted
+
+
 def test_a_copy_of_a_log_is_no_repeat(
     told: RingReport, log: Path, ring: Path, machine: Machine
 ) -> None:
