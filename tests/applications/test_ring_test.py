@@ -28,6 +28,7 @@ from stillpath.cli.own_machines import open_machines
 from stillpath.models.confirmation import Confirmation, confirmation_text, plants_digest
 from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
+from stillpath.models.plants import FirSpec, PlantSetSpec, PlantSpec
 from stillpath.models.store import load_machine
 from tests.service.ringing import SENSOR, TRUE, Chain, machine_of, recorded
 
@@ -272,8 +273,12 @@ def test_real_logs_of_other_motion_say_nothing(
         assert verdicts(report) == ["says nothing", "says nothing"]
 
 
-def test_a_ring_test_for_other_plants_says_nothing(ring: Path, log: Path) -> None:
-    other = machine_of({"x": Chain((45.0, 120.0)).spec(), "y": TRUE["y"].spec()})
+@pytest.mark.parametrize("plant", [Chain((45.0, 120.0)).spec(), FirSpec(taps=(1.0,), dt_s=1e-3)])
+def test_a_ring_test_for_other_plants_says_nothing(
+    plant: PlantSpec, machine: Machine, ring: Path, log: Path
+) -> None:
+    axes = {**machine.axes, "x": PlantSetSpec(nominal=plant)}
+    other = machine.model_copy(update={"axes": axes})
     report = verify_ring(ring, [log], other, today=TODAY)
     assert verdicts(report) == ["says nothing", "confirmed"]
     assert "write a new ring test" in report.axes[0].text
