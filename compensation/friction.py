@@ -73,7 +73,6 @@ class FrictionCompensator(Overlay):
         self.name = inner.name
         super().__init__(inner, machine, dt_s)
         self._held_mm = machine.friction_mm
-        self._travel = [machine.travel[axis] for axis in ("x", "y")]
 
     def compensate(
         self, y_d_mm: Array, extruding: NDArray[np.bool_], rests: NDArray[np.int64]
@@ -91,9 +90,3 @@ class FrictionCompensator(Overlay):
     def _against(self, wanted: Array, rests: NDArray[np.int64], rounded_s: float) -> Array:
         u = against_friction(wanted, self._held_mm, rests, self._dt_s, rounded_s)
         return self._within_travel(wanted, u)
-
-    def _within_travel(self, wanted: Array, u: Array) -> Array:
-        for row, inner, travel in zip(u, wanted, self._travel, strict=True):
-            low, high = min(travel.min_mm, inner.min()), max(travel.max_mm, inner.max())
-            np.clip(row, low, high, out=row)
-        return u

@@ -8,6 +8,7 @@ exactly 0.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -42,6 +43,8 @@ class LiveFilter:
         Sampling time, and limits of the command of an axis.
     bounds_mm : ndarray, shape (2, 2)
         Travel of X and Y.
+    motor_velocity_mm_s, motor_accel_mm_s2 : float
+        Limits of x + y and of x - y, the motors of a CoreXY.
     """
 
     taps: Array
@@ -49,6 +52,8 @@ class LiveFilter:
     velocity_mm_s: float
     accel_mm_s2: float
     bounds_mm: Array
+    motor_velocity_mm_s: float = math.inf
+    motor_accel_mm_s2: float = math.inf
 
     @property
     def margin(self) -> int:
@@ -100,9 +105,16 @@ class LiveFilter:
             size = np.maximum(np.abs(more), 1e-300)
             np.minimum(share, np.where(too_much, np.minimum(room, size) / size, 1.0), out=share)
 
+        def keep_moving(own: Array, more: Array, velocity_mm_s: float, accel_mm_s2: float) -> None:
+            keep(np.diff(own, 2), np.diff(more, 2), accel_mm_s2 * self.dt_s**2)
+            keep(np.diff(own)[:-1], np.diff(more)[:-1], velocity_mm_s * self.dt_s)
+
+        of_motors = self.motor_velocity_mm_s, self.motor_accel_mm_s2
+        if np.isfinite(of_motors).any():
+            keep_moving(plan[0] + plan[1], away[0] + away[1], *of_motors)
+            keep_moving(plan[0] - plan[1], away[0] - away[1], *of_motors)
         for own, more, (least, most) in zip(plan, away, self.bounds_mm, strict=True):
-            keep(np.diff(own, 2), np.diff(more, 2), self.accel_mm_s2 * self.dt_s**2)
-            keep(np.diff(own)[:-1], np.diff(more)[:-1], self.velocity_mm_s * self.dt_s)
+            keep_moving(own, more, self.velocity_mm_s, self.accel_mm_s2)
             centre = (least + most) / 2.0
             keep(own[1:-1] - centre, more[1:-1], (most - least) / 2.0)
         return share

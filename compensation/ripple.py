@@ -199,6 +199,7 @@ class RippleCompensator(Overlay):
             self.budget_mm_s2 = step * self._least_mm_s2
             u = self._undone(wanted, y_d_mm)
             u = wanted + stand_still(u - wanted, np.zeros_like(u), rests, self._blend)
+            u = self._within_travel(wanted, u)
             if not self._bounds.beyond(u, wanted).any():
                 return u
         self.budget_mm_s2 = 0.0

@@ -34,6 +34,8 @@ _MUST = {
     "dict_type": "must be a JSON object",
     "model_type": "must be a JSON object",
     "model_attributes_type": "must be a JSON object, sent as application/json",
+    "union_tag_invalid": "{discriminator} is '{tag}', and must be one of {expected_tags}",
+    "union_tag_not_found": "must have a {discriminator}",
     "missing": "is missing",
     "extra_forbidden": "is not known here",
 }

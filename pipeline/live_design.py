@@ -8,6 +8,7 @@ is chosen. The shaper itself is always among the candidates.
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache, partial
@@ -19,7 +20,7 @@ import numpy as np
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.live_filter import LiveFilter, design_taps, exact_moments, shaper_taps
 from stillpath.models.arrays import Array
-from stillpath.models.machine import Machine
+from stillpath.models.machine import Machine, MotorLimits
 from stillpath.models.plants import plant_set
 from stillpath.models.reference_motion import reference_motion_of
 from stillpath.pipeline.caution import (
@@ -37,7 +38,7 @@ from stillpath.pipeline.result import Channel
 __all__ = ["LiveDesign", "cached_live_design", "design_live", "live_filter"]
 
 DT_S = 1e-3
-_VERSION = 5
+_VERSION = 6
 """Part of the cache's name; rises when the design changes."""
 _CORNERS_HZ = (70.0, 90.0, 115.0, 150.0, 200.0, 270.0)
 _REACHES = (80, 160)
@@ -95,8 +96,16 @@ class LiveDesign:
 def live_filter(machine: Machine, taps: Array) -> LiveFilter:
     """Return the filter with these taps, shape (2, n), within the machine's command limits."""
     bounds = [(machine.travel[a].min_mm, machine.travel[a].max_mm) for a in ("x", "y")]
-    command = machine.command
-    return LiveFilter(taps, DT_S, command.velocity_mm_s, command.accel_mm_s2, np.array(bounds))
+    command, motors = machine.command, machine.command.motors or MotorLimits()
+    return LiveFilter(
+        taps,
+        DT_S,
+        command.velocity_mm_s,
+        command.accel_mm_s2,
+        np.array(bounds),
+        motors.velocity_mm_s or math.inf,
+        motors.accel_mm_s2 or math.inf,
+    )
 
 
 def design_live(machine: Machine, shaper: BestShaper) -> LiveDesign:

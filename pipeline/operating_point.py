@@ -114,7 +114,9 @@ class Operation:
             return
         self._level = level
         for node in self._grid.at_level(level):
-            for axis, plants in machine_at(self._machine, node).axes.items():
-                f_hz = float(resonances_hz(plants.nominal)[0])
+            axes = machine_at(self._machine, node).axes
+            # An axis without a schedule need not have a resonance.
+            for axis in self._machine.schedules:
+                f_hz = float(resonances_hz(axes[axis].nominal)[0])
                 low, high = self._used.get(axis, (f_hz, f_hz))
                 self._used[axis] = (min(low, f_hz), max(high, f_hz))

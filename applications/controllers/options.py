@@ -222,7 +222,7 @@ def read_options(document: Mapping[str, Any]) -> ControllerOptions:
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         method = document.get("method")
-        if first["type"].startswith("union_tag"):
+        if first["type"].startswith("union_tag") and not first["loc"]:
             raise DesignError(
                 f"unknown method {method!r}; there are {', '.join(METHODS)}"
             ) from None

@@ -62,10 +62,9 @@ def export_document(machine: Machine, design: LiveDesign) -> dict[str, Any]:
             "max_velocity_mm_s": limits.max_velocity_mm_s,
             "max_accel_mm_s2": limits.max_accel_mm_s2,
         },
-        "command": {
-            "velocity_mm_s": machine.command.velocity_mm_s,
-            "accel_mm_s2": machine.command.accel_mm_s2,
-        },
+        "command": machine.command.model_dump(
+            include={"velocity_mm_s", "accel_mm_s2", "motors"}, exclude_none=True
+        ),
         "axes": {
             axis: {
                 "taps": [round(float(tap), _DIGITS) for tap in design.taps[k]],

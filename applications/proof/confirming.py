@@ -417,7 +417,7 @@ def _band(plants: PlantSetSpec) -> Band:
     )
     rings = modes[modes[:, 1] < _RINGS, 0]
     if len(rings) == 0:
-        rings = modes[:, 0]
+        rings = modes[:, 0] if len(modes) else np.array([_HIGHEST_HZ])
     high_hz = min(1.4 * float(rings.max()), _HIGHEST_HZ)
     return Band(min(0.7 * float(rings.min()), 0.5 * high_hz), high_hz)
 

@@ -22,6 +22,7 @@ from stillpath.applications.proof.matching import (
 from stillpath.gcode.containers.opening import open_text
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.models.arrays import Array
+from stillpath.models.friction import DryFriction
 from stillpath.models.machine import Machine
 from stillpath.models.plants import PlantSpec, discretise
 from stillpath.models.schedule import EMPTY
@@ -141,7 +142,7 @@ def _another_print(report: dict[str, Any], found: Match) -> ReadbackReport:
 def _commanded(
     printed: Path, machine: Machine, progress: ProgressCallback | None
 ) -> tuple[Signal, float]:
-    """Return what the motors are sent in X and Y, after the firmware's shaper.
+    """Return what X and Y receive, after the firmware's shaper and dry friction.
 
     It is without the jumps of homing and macros. The second value is the time from which on the
     shaper is known.
@@ -174,7 +175,8 @@ def _commanded(
             if not known and part.shaping is before:
                 known_from_s = float(part.samples.t_s[-1])
     rows += [r.executed_mm for r, _ in shaper.flush()]
-    return Signal(0.0, 1.0 / _RATE_HZ, np.concatenate(rows, axis=1)), known_from_s
+    received = DryFriction(machine.friction_mm).received_mm(np.concatenate(rows, axis=1))
+    return Signal(0.0, 1.0 / _RATE_HZ, received), known_from_s
 
 
 def _acceleration(position: Array, dt_s: float) -> Array:

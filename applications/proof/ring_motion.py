@@ -22,6 +22,7 @@ from stillpath.applications.proof.ring_test import (
 )
 from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
+from stillpath.models.friction import DryFriction
 from stillpath.models.machine import Machine
 from stillpath.models.plants import PlantSpec, discretise
 from stillpath.models.runs import runs
@@ -59,7 +60,7 @@ class RingMotion:
     Attributes
     ----------
     command : Signal
-        Positions of X and Y in mm.
+        Positions of X and Y in mm, as dry friction lets the axes have them.
     quiet_s : dict
         By axis from when until when it stands still long before it moves (the other one creeps, as
         after the stops).
@@ -123,8 +124,9 @@ def read_ring_motion(printed: Path, machine: Machine) -> RingMotion:
         quiet[axis] = [(first / RATE_HZ, end / RATE_HZ) for first, end in runs(own["quiet"])]
         about[axis] = np.any(list(own.values()), axis=0)
     stops.sort(key=lambda stop: stop.at_s)
+    received = DryFriction(machine.friction_mm).received_mm(command)
     return RingMotion(
-        Signal(0.0, 1.0 / RATE_HZ, command), tuple(stops), quiet, about, _plants(printed)
+        Signal(0.0, 1.0 / RATE_HZ, received), tuple(stops), quiet, about, _plants(printed)
     )
 
 

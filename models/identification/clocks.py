@@ -26,6 +26,7 @@ from stillpath.models.identification.types import (
     FrequencyResponse,
 )
 from stillpath.models.plants import ParametricMembers, PlantSetSpec, PlantSpec, frequency_response
+from stillpath.models.schedule import AxisSchedule
 
 __all__ = ["Lateness", "lateness", "timed"]
 
@@ -118,7 +119,9 @@ def timed(
         f"by the clocks of the logs the axis follows {1e3 * delay_of(plants.nominal):.2f} ms later "
         f"than {other}: commands allow for it"
     )
-    return {**found, later: replace(one, plants=plants, notes=(*one.notes, note))}
+    schedule = _later_places(one.schedule, later_s)
+    notes = (*one.notes, note)
+    return {**found, later: replace(one, plants=plants, schedule=schedule, notes=notes)}
 
 
 def _agreeing(logs: Sequence[Lateness]) -> list[Lateness]:
@@ -152,6 +155,17 @@ def _later(plants: PlantSetSpec, delay_s: float, unsure_s: float) -> PlantSetSpe
             "provenance": about,
         }
     )
+
+
+def _later_places(schedule: AxisSchedule | None, delay_s: float) -> AxisSchedule | None:
+    if schedule is None or schedule.grid is None:
+        return schedule
+    nodes = tuple(
+        node.model_copy(update={"plant": delayed(node.plant, delay_s)})
+        for node in schedule.grid.nodes
+    )
+    grid = schedule.grid.model_copy(update={"nodes": nodes})
+    return schedule.model_copy(update={"grid": grid})
 
 
 def _alike(apart_s: Array) -> float | None:

@@ -12,7 +12,7 @@ f = h v / p, and dividing by -(2 pi f)^2 integrates twice.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -188,9 +188,10 @@ def update_ripple(
     if not 0.0 < gain <= 1.0:
         raise ModelError(f"learning gain {gain} must lie above 0 and not above 1")
     old, new = _by_wave(known), _by_wave(learnt)
-    for name, pitch_mm, enters, _ in new:
-        for other, other_pitch, other_side, _ in old:
-            if name == other and (pitch_mm, enters) != (other_pitch, other_side):
+    parts, learnt_parts = (dict.fromkeys(wave[:3] for wave in waves) for waves in (old, new))
+    for name, pitch_mm, enters in learnt_parts:
+        for other, other_pitch, other_side in parts:
+            if name == other and (name, pitch_mm, enters) not in parts:
                 raise ModelError(
                     f"ripple {name!r}: pitch {pitch_mm:g} mm, {enters}, but the table has "
                     f"{other_pitch:g} mm, {other_side}; name it otherwise, or learn afresh"
@@ -206,7 +207,7 @@ def update_ripple(
             sd = math.hypot(keep * sd_before, gain * sd_learnt)
         merged.setdefault(wave[:3], []).append(_harmonic(wave[3], c, sd))
     return _axis_ripple(
-        tuple(
+        (
             RippleSource(name=name, pitch_mm=pitch_mm, enters=enters, harmonics=tuple(harmonics))
             for (name, pitch_mm, enters), harmonics in merged.items()
         ),
@@ -379,34 +380,34 @@ def _rms_beside(columns: Array, values: Array) -> float:
     return math.sqrt(float(left @ left) / len(left))
 
 
-def _axis_ripple(sources: tuple[RippleSource, ...], repeatability_mm: float) -> AxisRipple:
+def _axis_ripple(sources: Iterable[RippleSource], repeatability_mm: float) -> AxisRipple:
     try:
-        return AxisRipple(sources=sources, homing_repeatability_mm=repeatability_mm)
+        return AxisRipple(sources=tuple(sources), homing_repeatability_mm=repeatability_mm)
     except ValidationError as error:
-        said = error.errors()[0]["msg"].removeprefix("Value error, ")
+        first = error.errors()[0]
+        remedy = "is it this axis's plant, and the log's unit right?"
+        if first["type"] == "too_long":
+            remedy = f"learn fewer {first['loc'][-1]}"
         raise ModelError(
-            f"what the passes teach cannot be the ripple of an axis: {said}; is it this axis's "
-            "plant, and the log's unit right?"
+            "what the passes teach cannot be the ripple of an axis: "
+            f"{first['msg'].removeprefix('Value error, ')}; {remedy}"
         ) from None
 
 
-def _sources(basis: Sequence[WaveBasis], c_mm: Complex, sd_mm: Array) -> tuple[RippleSource, ...]:
-    out, first = [], 0
+def _sources(basis: Sequence[WaveBasis], c_mm: Complex, sd_mm: Array) -> Iterator[RippleSource]:
+    first = 0
     for source in basis:
         harmonics = tuple(
             _harmonic(number, complex(c_mm[first + k]), float(sd_mm[first + k]))
             for k, number in enumerate(source.numbers)
         )
-        out.append(
-            RippleSource(
-                name=source.name,
-                pitch_mm=source.pitch_mm,
-                enters=source.enters,
-                harmonics=harmonics,
-            )
+        yield RippleSource(
+            name=source.name,
+            pitch_mm=source.pitch_mm,
+            enters=source.enters,
+            harmonics=harmonics,
         )
         first += len(source.numbers)
-    return tuple(out)
 
 
 def _harmonic(number: int, c_mm: complex, sd_mm: float) -> RippleHarmonic:

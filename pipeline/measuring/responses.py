@@ -69,7 +69,7 @@ class Responses:
         # Plants that change do so where the motion has come to.
         self._least = 1 if machine.schedules else _LEAST_SAMPLES
         # A linear machine's response to a shaped path is its shaped response to the path.
-        linear = not machine.schedules and not machine.ripple
+        linear = not (machine.schedules or machine.ripple or any(machine.friction_mm))
         self._shapes_answer = linear and self._compensated and {"before", "shaper"} <= set(names)
         self._streams: dict[str, MachineStream] = {}
         self._planned, self._executed = np.zeros((2, 0)), np.zeros((2, 0))

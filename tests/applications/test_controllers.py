@@ -182,6 +182,12 @@ REFUSED: list[tuple[str, dict[str, Any], str]] = [
     ("galvo-40khz", FMSDOB | {"alpha": 0.5}, "no setting alpha"),
     ("galvo-40khz", {"method": "fmsdob"}, "needs targets_hz"),
     ("galvo-40khz", {"method": "magic"}, "'magic'; there are fmsdob"),
+    (
+        "galvo-40khz",
+        FMSDOB | {"disturbance": {"kind": "sine"}},
+        r"fmsdob: disturbance: 'kind' is 'sine', and must be one of 'narrowband'",
+    ),
+    ("galvo-40khz", FMSDOB | {"disturbance": {}}, "fmsdob: disturbance: must have a 'kind'"),
     ("galvo-40khz", {"method": "dob", "cutoff_hz": 100}, "zero"),
     ("galvo-40khz", {"method": "inverse-dob", "targets_hz": [2000]}, "fmsdob"),
     ("galvo-40khz", {"method": "mmp", "targets_hz": [2000]}, "slower than the loop"),

@@ -71,6 +71,14 @@ def test_refusals_leave_nothing(folder: Path, capsys: pytest.CaptureFixture[str]
     assert "--axis" in capsys.readouterr().err
 
 
+def test_a_report_that_ripple_has_not_is_refused(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert learn(folder, "--base", str(folder / "base.json"), "--report", str(folder / "r")) == 2
+    assert "leave --report out" in capsys.readouterr().err
+    assert not (folder / "r").exists()
+
+
 def test_a_file_of_more_rows_than_a_pass_has(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -38,7 +38,11 @@ def modes(report) -> dict[str, float]:
     return {axis.axis: axis.f_hz / axis.model_hz for axis in report.axes}
 
 
-def test_a_machine_like_its_model(machine, printed, tmp_path):
+@pytest.mark.parametrize("friction_mm", [None, 0.05])
+def test_a_machine_like_its_model(friction_mm, machine, printed, tmp_path):
+    update = {"friction_mm": friction_mm}
+    axes = {a: plants.model_copy(update=update) for a, plants in machine.axes.items()}
+    machine = machine.model_copy(update={"axes": axes})
     record(printed, machine, tmp_path / "log.csv", start_s=280, seconds=40)
     report = verify_log(printed, tmp_path / "log.csv", machine)
     assert report.outcome == "the model holds"

@@ -28,6 +28,7 @@ from stillpath.cli.own_machines import open_machines
 from stillpath.models.confirmation import Confirmation, confirmation_text, plants_digest
 from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
+from stillpath.models.plants import FirSpec, PlantSetSpec, PlantSpec
 from stillpath.models.store import load_machine
 from tests.service.ringing import SENSOR, TRUE, Chain, machine_of, recorded
 
@@ -193,6 +194,25 @@ def test_a_machine_like_its_plants_is_confirmed(told: RingReport, log: Path) -> 
         assert found.tested_on == TODAY
 
 
+def test_friction_that_is_known_counts_in_what_is_predicted(
+    machine: Machine, told: RingReport, cache: Path, tmp_path: Path
+) -> None:
+    """What the command adds against it does not ring."""
+    true = {axis: replace(chain, friction_n=1.0) for axis, chain in TRUE.items()}
+    held_mm = {"x": 0.0193, "y": 0.0315}
+    axes = {a: p.model_copy(update={"friction_mm": held_mm[a]}) for a, p in machine.axes.items()}
+    rubbing = machine.model_copy(update={"axes": axes})
+    ring = tmp_path / "ring.gcode"
+    write_ring_test(rubbing, ring, cache_dir=cache)
+    content = recorded(ring, rubbing, true).raw_data()
+    report = said_of(tmp_path / "a.csv", ring, rubbing, content)
+    for axis, smooth in zip(report.axes, told.axes, strict=True):
+        assert axis.compensated is not None
+        assert smooth.compensated is not None
+        wanted = pytest.approx(smooth.compensated.predicted_um, rel=0.3)
+        assert axis.compensated.predicted_um == wanted
+
+
 def test_a_copy_of_a_log_is_no_repeat(
     told: RingReport, log: Path, ring: Path, machine: Machine
 ) -> None:
@@ -253,8 +273,12 @@ def test_real_logs_of_other_motion_say_nothing(
         assert verdicts(report) == ["says nothing", "says nothing"]
 
 
-def test_a_ring_test_for_other_plants_says_nothing(ring: Path, log: Path) -> None:
-    other = machine_of({"x": Chain((45.0, 120.0)).spec(), "y": TRUE["y"].spec()})
+@pytest.mark.parametrize("plant", [Chain((45.0, 120.0)).spec(), FirSpec(taps=(1.0,), dt_s=1e-3)])
+def test_a_ring_test_for_other_plants_says_nothing(
+    plant: PlantSpec, machine: Machine, ring: Path, log: Path
+) -> None:
+    axes = {**machine.axes, "x": PlantSetSpec(nominal=plant)}
+    other = machine.model_copy(update={"axes": axes})
     report = verify_ring(ring, [log], other, today=TODAY)
     assert verdicts(report) == ["says nothing", "confirmed"]
     assert "write a new ring test" in report.axes[0].text

@@ -94,13 +94,17 @@ def test_a_set_is_not_worse_than_its_middle_on_its_edges() -> None:
     assert worst(both) < worst(middle)
 
 
-def test_limits_are_kept_where_the_plan_keeps_them() -> None:
+@pytest.mark.parametrize("motors", [False, True])
+def test_limits_are_kept_where_the_plan_keeps_them(motors: bool) -> None:
     a = np.zeros(3000)
     a[500:530], a[900:930], a[1500:1530], a[2200:2230] = 4e3, -4e3, -4e3, 4e3
     row = np.cumsum(np.cumsum(a)) * DT_S**2
     taps = np.stack([design_taps([mode(30.0, 0.03)], np.ones(1), 270.0)] * 2)
     limits, bounds = (500.0, 4200.0), np.array([[-1.0, 1e3]] * 2)
     live = LiveFilter(taps, DT_S, *limits, bounds)
+    if motors:
+        # One of a CoreXY moves with x + y, here with twice the motion of X.
+        live = LiveFilter(taps, DT_S, 1e9, 1e9, bounds, *(2.0 * limit for limit in limits))
     free = LiveFilter(taps, DT_S, 1e9, 1e9, np.array([[-1e9, 1e9]] * 2))
     padded = np.pad(np.stack([row, row]), ((0, 0), (400, 400)), mode="edge")
 

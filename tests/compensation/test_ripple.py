@@ -11,7 +11,7 @@ from stillpath.compensation.base import DesignError
 from stillpath.compensation.registry import compensator
 from stillpath.compensation.ripple import PassThrough, RippleCompensator, input_command, wave_shares
 from stillpath.models.identification.ripple import PassLog, WaveBasis, learn_ripple, update_ripple
-from stillpath.models.machine import CommandLimits, Machine
+from stillpath.models.machine import AxisTravel, CommandLimits, Machine
 from stillpath.models.plants import Mode, ModesSpec, PlantSetSpec, continuous
 from stillpath.models.ripple import (
     AxisRipple,
@@ -166,6 +166,22 @@ class TestLimits:
         assert np.abs(np.diff(u, 2)).max() / DT**2 <= 10_000.0
         assert 0 < made.budget_mm_s2 < 10_000.0
 
+    @pytest.mark.parametrize("side", [1.0, -1.0])
+    def test_ends_with_the_travel(self, side: float) -> None:
+        """X stands at an end of the travel for a while, where the table would have it beyond."""
+        places = np.linspace(100.0, 102.0, 201)
+        end_mm = places[np.argmin(side * axis_ripple().table("input").deviation_mm(places))]
+        way = drive("constant", 3.0)[0]
+        there = end_mm + side * (way - way[-1])
+        x = np.concatenate([there, np.full(500, end_mm), there[::-1]])
+        machine = printer()
+        ends = AxisTravel(min_mm=float(x.min()), max_mm=float(x.max()))
+        machine = machine.model_copy(update={"travel": {**machine.travel, "x": ends}})
+        path = np.stack([x, np.full(len(x), 50.0)])
+        u = undo(path, axis_ripple(), machine)[0]
+        assert ends.min_mm <= u.min() < u.max() <= ends.max_mm
+        assert np.ptp((u - x)[: len(way)]) > 0.03
+
     def test_slow_motion_has_all_of_every_wave(self) -> None:
         path = drive("constant", speed=20.0)[0]
         shares = wave_shares(path, axis_ripple().table("input"), DT, 20_000.0)
@@ -183,7 +199,7 @@ class TestAxes:
     def test_motors_of_corexy(self) -> None:
         """Ripple of motor A shows in X and Y; with the table, A receives what it should."""
         machine = printer(name="generic-corexy")
-        path = drive("constant")
+        path = drive("constant", 3.0) + 30.0
         made = RippleCompensator(PassThrough(), rippled(machine, a=axis_ripple()), DT)
         u = made.compensate(path, np.ones(path.shape[1], bool), NO_RESTS)
         a, b = u[0] + u[1], u[0] - u[1]

@@ -14,6 +14,7 @@ from stillpath.compensation.scheduled import BLEND_STEP, DESIGN_STEP, ScheduledC
 from stillpath.models.machine import CommandLimits, Machine
 from stillpath.models.operating import OperatingGrid, machine_at
 from stillpath.models.plants import Mode, ModesSpec, plant_set
+from stillpath.models.ripple import AxisRipple, RippleHarmonic, RippleSource
 from stillpath.models.schedule import (
     AxisSchedule,
     GridNode,
@@ -90,6 +91,19 @@ def test_one_operating_point_changes_nothing(method: str) -> None:
     points = [OperatingPoint(mass_kg=m) for m in (0.0, 0.2, 0.5)]
     for a, b in zip(run(plain, jobs, points), run(following, jobs, points), strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+def test_standstill_for_a_shaper_follows_its_length() -> None:
+    machine = bedslinger(0.8)
+    harmonic = RippleHarmonic(number=1, amplitude_um=5.0, phase_deg=0.0)
+    source = RippleSource(name="belt", pitch_mm=2.0, harmonics=(harmonic,))
+    machine = machine.model_copy(update={"ripple": {"x": AxisRipple(sources=(source,))}})
+    plain, over = (compensator(name, machine, DT_S) for name in ("shaper:mzv", "shaper:mzv+ripple"))
+    empty_s = plain.lead_s
+    for one in (plain, over):
+        one.operate_at(HALF)
+    assert plain.lead_s > 1.2 * empty_s
+    assert (over.lead_s, over.tail_s) == (plain.lead_s, plain.tail_s)
 
 
 def test_takes_over_the_vibration() -> None:

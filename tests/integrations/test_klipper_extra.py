@@ -11,7 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stillpath.compensation.live_filter import FADE, LiveFilter, design_taps
+from stillpath.applications.live.export import export_document, export_text
+from stillpath.compensation.live_filter import FADE, LiveFilter, design_taps, shaper_taps
+from stillpath.models.machine import CommandLimits, MotorLimits
+from stillpath.models.store import load_machine
+from stillpath.pipeline.live_design import LiveDesign, live_filter
+from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from tests.compensation.test_live_filter import mode
 from tests.integrations.hostile_exports import HOSTILE
 from tests.loading import module_at
@@ -42,20 +47,28 @@ def zigzag(count: int, accel: float = 5e3, size: float = 40.0) -> list[tuple[flo
     return moves
 
 
-def given(taps: np.ndarray, accel: float = 1e5) -> Any:
+def given(taps: np.ndarray, accel: float = 1e5, of_motors: float = np.inf) -> Any:
     return SimpleNamespace(
         taps=[list(row) for row in taps], reach=taps.shape[1] // 2, sample_s=DT_S,
-        velocity_mm_s=1e3, accel_mm_s2=accel,
+        velocity_mm_s=1e3, accel_mm_s2=accel, motor_velocity_mm_s=np.inf,
+        motor_accel_mm_s2=of_motors,
     )  # fmt: skip
 
 
 @pytest.mark.parametrize(
-    ("accel", "batch"), [pytest.param(1e5, 250, marks=pytest.mark.slow), (5200.0, 37)]
+    ("accel", "of_motors", "batch"),
+    [
+        pytest.param(1e5, np.inf, 250, marks=pytest.mark.slow),
+        (5200.0, np.inf, 37),
+        (1e5, 5200.0, 100),
+    ],
 )
-def test_it_filters_as_the_prediction_does(extra: ModuleType, accel: float, batch: int) -> None:
+def test_it_filters_as_the_prediction_does(
+    extra: ModuleType, accel: float, of_motors: float, batch: int
+) -> None:
     taps = np.stack([design_taps([mode(f, 0.05)], np.ones(1), 150.0) for f in (45.0, 30.0)])
     bounds = [(-1e3, 1e3)] * 2
-    ours = extra.Filter(given(taps, accel), bounds)
+    ours = extra.Filter(given(taps, accel, of_motors), bounds)
     ours.rest_at(50.0, 50.0)
     moves = zigzag(40)
     end = round(moves[-1][0] / DT_S) + 1500
@@ -77,14 +90,27 @@ def test_it_filters_as_the_prediction_does(extra: ModuleType, accel: float, batc
     x: list[float] = []
     y: list[float] = []
     plan.sample(0, end, DT_S, x, y)
-    live = LiveFilter(taps, DT_S, 1e3, accel, np.array(bounds))
+    live = LiveFilter(taps, DT_S, 1e3, accel, np.array(bounds), np.inf, of_motors)
     padded = np.pad(np.array([x, y]), ((0, 0), (live.margin, live.margin)), mode="edge")
     wanted = live.command(padded)
-    assert (ours.limited > 0) == (accel < 1e4)
+    assert (ours.limited > 0) == (min(accel, of_motors) < 1e4)
     for k, place in command.items():
         assert place == pytest.approx(wanted[:, k], abs=1e-9) if k < end - batch else True
     moving = np.flatnonzero(np.any(np.abs(np.diff(wanted[:, : end - batch])) > 1e-6, axis=0))
     assert set(moving[1:].tolist()) <= command.keys()
+
+
+def test_what_the_motors_of_a_corexy_bear_goes_along(extra: ModuleType, tmp_path: Path) -> None:
+    command = CommandLimits(accel_mm_s2=12_000.0, motors=MotorLimits(accel_mm_s2=17_000.0))
+    machine = load_machine("voron-v24-250").model_copy(update={"command": command})
+    shaper = BestShaper("zv", 50.0, 50.0, 0.1, 0.0, 0.0)
+    taps = np.stack([shaper_taps(pulses, DT_S) for pulses in shaper.pulses])
+    design = LiveDesign(taps, (0.0, 0.0), 0.0, shaper, 1.0, 1.0, {}, 0.0)
+    file = tmp_path / "export.json"
+    file.write_text(export_text(export_document(machine, design)))
+    for one in (extra.read_export(file), live_filter(machine, taps)):
+        assert (one.velocity_mm_s, one.accel_mm_s2) == (500.0, 12_000.0)
+        assert (one.motor_velocity_mm_s, one.motor_accel_mm_s2) == (np.inf, 17_000.0)
 
 
 @pytest.mark.slow

@@ -257,6 +257,32 @@ class TestUpdate:
         with pytest.raises(ModelError, match="learn afresh"):
             update_ripple(ripple(), other)
 
+    def test_parts_of_one_name_are_told_by_their_pitch(self) -> None:
+        wave = RippleHarmonic(number=1, amplitude_um=5.0, phase_deg=20.0)
+        parts = [RippleSource(name="belt", pitch_mm=p, harmonics=(wave,)) for p in (2.0, 40.0)]
+        known = AxisRipple(sources=tuple(parts))
+        made = update_ripple(known, known)
+        assert [source.pitch_mm for source in made.sources] == [2.0, 40.0]
+
+    def test_too_many_harmonics_are_refused(self) -> None:
+        few, many = (
+            AxisRipple(
+                sources=(
+                    RippleSource(
+                        name="belt",
+                        pitch_mm=40.0,
+                        harmonics=tuple(
+                            RippleHarmonic(number=n, amplitude_um=0.1, phase_deg=0.0)
+                            for n in numbers
+                        ),
+                    ),
+                )
+            )
+            for numbers in (range(1, 31), range(31, 91))
+        )
+        with pytest.raises(ModelError, match=r"at most 64 .* learn fewer harmonics"):
+            update_ripple(few, many)
+
     @pytest.mark.parametrize("gain", [0.0, 1.5])
     def test_gain(self, gain: float) -> None:
         with pytest.raises(ModelError, match="gain"):

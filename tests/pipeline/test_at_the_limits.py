@@ -19,15 +19,17 @@ from tests.compensating import compensated
 from tests.gcode.cutting import HEAD, pieces_of
 
 
-@pytest.mark.parametrize("edge_mm", [100.0, 100.0006])
-def test_a_wall_on_the_edge_of_the_bed(edge_mm: float) -> None:
+@pytest.mark.parametrize(
+    ("method", "edge_mm"), [("fbf", 100.0), ("fbf", 100.0006), ("shaper:mzv", 77.7)]
+)
+def test_a_wall_on_the_edge_of_the_bed(method: str, edge_mm: float) -> None:
     """The path and its command lie on the edge; neither tolerance nor rounding may leave it."""
     machine = load_machine("ender3")
     edges = AxisTravel(min_mm=0.0, max_mm=edge_mm)
     machine = machine.model_copy(update={"travel": machine.travel | {"x": edges}})
     wall = f"G1 X{edge_mm} Y60 E2 F6000\nG1 Y90 E2\nG1 X60 E2\n"
     piece = pieces_of(HEAD + wall, machine)[-1]
-    made = PieceCompensator(machine, Options()).compensate(piece)
+    made = PieceCompensator(machine, Options(method=method)).compensate(piece)
     assert edge_mm - 1e-3 < made.encoded.position[:, 0].max() / 1e6 <= edge_mm
 
 

@@ -46,8 +46,13 @@ def pushed(
     yield answers.flush()
 
 
-@pytest.mark.parametrize("compensated", [True, False])
-def test_parts(ender: Machine, compensated: bool) -> None:
+@pytest.mark.parametrize(
+    ("compensated", "friction_mm"), [(True, None), (False, None), (True, 0.01)]
+)
+def test_parts(ender: Machine, compensated: bool, friction_mm: float | None) -> None:
+    update = {"friction_mm": friction_mm}
+    axes = {a: plants.model_copy(update=update) for a, plants in ender.axes.items()}
+    ender = ender.model_copy(update={"axes": axes})
     names = NAMES if compensated else ("before", "shaper")
     answers = Responses(ender, DT_S, SHAPER, names)
     pulses = [shaper_pulses("mzv", f_hz, 0.1) for f_hz in (SHAPER.fx_hz, SHAPER.fy_hz)]

@@ -15,6 +15,7 @@ import pytest
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.types import Moves
 from stillpath.models.machine import Machine
+from stillpath.models.plants import FirSpec, PlantSetSpec
 from stillpath.models.provenance import Provenance
 from stillpath.models.schedule import AxisSchedule, GridNode, GridSchedule, MassSchedule
 from stillpath.models.store import load_machine
@@ -81,6 +82,16 @@ def test_what_lies_on_the_bed(text: str, laid_mm: float) -> None:
     for moves in moves_of(f"{HEAD}G1 X20 Y20 Z0.2 F3000\n{text}\n", machine):
         operation.passed(moves)
     assert operation.printed_kg == pytest.approx(laid_mm * KG_PER_MM, rel=1e-6)
+
+
+def test_an_axis_without_a_resonance_beside_one_that_grows_heavier() -> None:
+    machine = bedslinger()
+    rigid = PlantSetSpec(nominal=FirSpec(taps=(1.0,), dt_s=1e-3))
+    machine = machine.model_copy(update={"axes": {**machine.axes, "x": rigid}})
+    operation = Operation(machine)
+    operation.at(moves_of("G28\nG1 X50 Y9 F3000\n", machine)[0])
+    (note,) = operation.notes()
+    assert note.startswith("The plant of axis y follows the mass on the bed")
 
 
 def test_where_a_piece_is() -> None:

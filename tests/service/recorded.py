@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from stillpath.models.friction import DryFriction
 from stillpath.models.machine import Machine
 from stillpath.models.plants import discretise
 from stillpath.models.shaping import OFF, Shaping
@@ -64,7 +65,7 @@ def record(
         discretise(machine.axes[axis].nominal.scaled(factor, damping), 1 / _RATE_HZ)
         for axis, factor in zip(("x", "y"), frequency, strict=True)
     ]
-    nozzle = PlantStream(plants).push(position)
+    nozzle = PlantStream(plants).push(DryFriction(machine.friction_mm).received_mm(position))
     accel = np.zeros_like(nozzle)
     accel[:, 1:-1] = np.diff(nozzle, 2) * _RATE_HZ**2
     count = int(seconds * rate_hz)

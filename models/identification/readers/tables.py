@@ -184,7 +184,8 @@ def as_table(text: str, source: str) -> Table:
     delimiter = _delimiter(rows[0] if rows else header)
     if delimiter == "," and "," not in header:
         # Commas within numbers: the header tells what is between them.
-        delimiter = _delimiter(header) or delimiter
+        width = len(rows[0].split(";")) if rows else 0
+        delimiter = _delimiter(header or _commented_header(comments, ";", width)) or delimiter
     if not header and rows:
         header = _commented_header(comments, delimiter, len(rows[0].split(delimiter)))
     table = Table(

@@ -28,6 +28,8 @@ from stillpath.models.plants import (
     RelativeModesSpec,
     frequency_response,
 )
+from stillpath.models.provenance import Provenance
+from stillpath.models.schedule import AxisSchedule, GridNode, GridSchedule, OperatingPoint
 
 TEST = Excitation((1.0, 0.0), f_start_hz=5.0, f_end_hz=100.0, hz_per_s=2.0)
 GUIDED = RelativeModesSpec(
@@ -131,6 +133,26 @@ def test_what_the_logs_of_both_axes_agree_on(
     }
     assert told_ms == pytest.approx(expected_ms, rel=1e-4)
     assert [axis for axis, one in found.items() if one.notes] == list(expected_ms)
+
+
+def test_designs_and_other_places_have_the_delay_too() -> None:
+    stiffer = RelativeModesSpec(modes=(RelativeMode(f_hz=52.0, zeta=0.05, share=1.0),))
+    nodes = (GridNode(z_mm=0.0, plant=FREE), GridNode(z_mm=200.0, plant=stiffer))
+    both = {
+        axis: replace(
+            one,
+            plants=one.plants.model_copy(update={"provenance": Provenance(kind="raw log")}),
+            schedule=AxisSchedule(grid=GridSchedule(nodes=nodes)),
+        )
+        for axis, one in BOTH.items()
+    }
+    found = timed(both, {"x": [ON_TIME], "y": [in_bands(0.5, 0.5, 0.5, 0.5)]})
+    assert found["x"].schedule == both["x"].schedule
+    schedule = found["y"].schedule
+    assert schedule is not None
+    for z_mm in (0.0, 200.0):
+        plants = schedule.plants(found["y"].plants, OperatingPoint(z_mm=z_mm)).without_delay()
+        assert delay_of(plants.nominal) == pytest.approx(0.2e-3, rel=1e-4)
 
 
 def test_an_axis_of_little_damping_is_as_late_as_that_allows() -> None:

@@ -105,11 +105,11 @@ def test_every_cut_is_read_or_refused(name: str) -> None:
             assert read_content(whole[:size], name)
 
 
-@pytest.mark.parametrize("delimiter", [";", "\t"])
-def test_what_spreadsheets_write(delimiter: str) -> None:
+@pytest.mark.parametrize(("delimiter", "mark"), [(";", ""), ("\t", ""), (";", "#")])
+def test_what_spreadsheets_write(delimiter: str, mark: str) -> None:
     """Tables in UTF-16 are read; decimal commas have a message of their own."""
     at = np.arange(100)
-    rows = [("time_s", "cmd_acc", "meas_acc")]
+    rows = [(f"{mark}time_s", "cmd_acc", "meas_acc")]
     rows += [(f"{0.01 * k:.2f}", f"{k % 7:.1f}", f"{k % 5:.1f}") for k in at]
     text = "\r\n".join(delimiter.join(row) for row in rows) + "\r\n"
     for encoding in ("utf-8", "utf-16"):

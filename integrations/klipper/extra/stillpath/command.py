@@ -73,6 +73,15 @@ class Plan:
         self.here = (x, y)
 
 
+def _part(change, most):
+    """Return the largest part of what is added to the plan's change that keeps a limit."""
+    plan, more = change
+    if abs(plan + more) <= most:
+        return 1.0
+    room = most - (plan if more > 0.0 else -plan)
+    return max(0.0, room / abs(more)) if more else 0.0
+
+
 class Filter:
     """The command of X and Y, sample by sample: plan + share * (filtered plan - plan).
 
@@ -89,6 +98,8 @@ class Filter:
         self.preview_s = (self.far + MARGIN) * export.sample_s
         self.most_step = export.velocity_mm_s * export.sample_s
         self.most_turn = export.accel_mm_s2 * export.sample_s**2
+        self.most_motor_step = export.motor_velocity_mm_s * export.sample_s
+        self.most_motor_turn = export.motor_accel_mm_s2 * export.sample_s**2
         self.bounds = bounds
         self.passing = False
         self.blocked = deque()
@@ -179,23 +190,31 @@ class Filter:
     def _share(self, i):
         """Return the largest share that keeps all limits at a sample."""
         share = 1.0
+        steps, turns = [], []
         for values, devs, (least, most) in (
             (self.x, self.dx, self.bounds[0]),
             (self.y, self.dy, self.bounds[1]),
         ):
             d = devs[i]
-            plan_turn = values[i - 1] - 2.0 * values[i] + values[i + 1]
-            more_turn = devs[i - 1] - 2.0 * d + devs[i + 1]
-            if abs(plan_turn + more_turn) > self.most_turn:
-                room = self.most_turn - (plan_turn if more_turn > 0.0 else -plan_turn)
-                share = min(share, max(0.0, room / abs(more_turn)) if more_turn else 0.0)
-            plan_step, more_step = values[i] - values[i - 1], d - devs[i - 1]
-            if abs(plan_step + more_step) > self.most_step:
-                room = self.most_step - (plan_step if more_step > 0.0 else -plan_step)
-                share = min(share, max(0.0, room / abs(more_step)) if more_step else 0.0)
+            turn = (
+                values[i - 1] - 2.0 * values[i] + values[i + 1],
+                devs[i - 1] - 2.0 * d + devs[i + 1],
+            )
+            step = (values[i] - values[i - 1], d - devs[i - 1])
+            share = min(share, _part(turn, self.most_turn), _part(step, self.most_step))
+            turns.append(turn)
+            steps.append(step)
             if not least <= values[i] + d <= most:
                 room = (most - values[i]) if d > 0.0 else (values[i] - least)
                 share = min(share, max(0.0, room / abs(d)) if d else 0.0)
+        for both, most in ((turns, self.most_motor_turn), (steps, self.most_motor_step)):
+            if most < math.inf:
+                (x, more_x), (y, more_y) = both
+                share = min(
+                    share,
+                    _part((x + y, more_x + more_y), most),
+                    _part((x - y, more_x - more_y), most),
+                )
         return share
 
     def _emit(self, count, pieces):

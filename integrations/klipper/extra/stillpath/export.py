@@ -29,6 +29,10 @@ class Export:
         self.max_accel = _number(limits, "max_accel_mm_s2", 1.0, 1e6)
         self.velocity_mm_s = _number(command, "velocity_mm_s", 1.0, 1e4)
         self.accel_mm_s2 = _number(command, "accel_mm_s2", 1.0, 1e6)
+        # Of x + y and of x - y, where a CoreXY states them.
+        motors = {"velocity_mm_s": math.inf, "accel_mm_s2": math.inf, **command.get("motors", {})}
+        self.motor_velocity_mm_s = _number(motors, "velocity_mm_s", 1.0, math.inf)
+        self.motor_accel_mm_s2 = _number(motors, "accel_mm_s2", 1.0, math.inf)
         self.taps = [_taps(content["axes"][axis]["taps"], axis, self.sample_s) for axis in "xy"]
         if len(self.taps[0]) != len(self.taps[1]):
             raise Refused("x and y have different numbers of taps")
