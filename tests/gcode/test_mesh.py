@@ -60,9 +60,10 @@ def test_a_tilted_plane_keeps_the_times(slope: float, kind: str) -> None:
     # The way is longer by the square root of 1 + slope^2 where it climbs; no limit of Z binds.
     longer = seconds(tilted) - seconds(level)
     bound = 0.5 * slope**2 * seconds(level)
-    assert -1e-5 <= longer <= bound + 1e-5
-    late_mm = bound * float(np.max(level.cruise_mm_s))
     # Marlin's whole steps fall differently.
+    steps_s = 1e-4 if kind == "marlin" else 1e-5
+    assert -steps_s <= longer <= bound + steps_s
+    late_mm = bound * float(np.max(level.cruise_mm_s))
     late_mm += 5e-3 if kind == "marlin" else 1e-3
     assert deviation(made, tilted).max() <= deviation(made, level).max() + late_mm
     np.testing.assert_allclose(tilted.direction[-1, :2], level.direction[-1, :2], atol=1e-4)

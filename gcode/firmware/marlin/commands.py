@@ -166,7 +166,12 @@ def filament_area(state: MachineState, command: Command) -> int:
     area = math.pi * diameter**2 / 4.0 if on else 1.0
     f = state.f
     before = f[at.F_UNIT_E_MM]
-    f[at.F_UNIT_E_MM] = (f[at.F_UNIT_MM] ** 3 if on else f[at.F_UNIT_MM]) / area
+    cubic = f[at.F_UNIT_MM] ** 3
+    area_before = 1.0 if before == f[at.F_UNIT_MM] else cubic / before
+    f[at.F_UNIT_E_MM] = (cubic if on else f[at.F_UNIT_MM]) / area
+    # What the printer takes for E stays: as many mm as there were cubic mm, or vice versa.
+    counted = f[at.F_LAST + 3] - f[at.F_BASE + 3]
+    f[at.F_BASE + 3] = f[at.F_LAST + 3] - counted * area_before / area
     if on:
         state.warn("E is in cubic millimetres (M200); such moves stay as they are")
     return state.event(EventKind.MODE if f[at.F_UNIT_E_MM] == before else EventKind.STATE)
