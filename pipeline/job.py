@@ -23,7 +23,7 @@ from stillpath.gcode.firmware.planning import join_phases
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.firmware.writing import StreamWriter
 from stillpath.gcode.interpreter import Interpreter
-from stillpath.gcode.pieces import Piece, VerbatimPart
+from stillpath.gcode.pieces import LeftOut, Piece, VerbatimPart
 from stillpath.gcode.plan import plan_moves
 from stillpath.gcode.slicers.facts import SlicerFacts
 from stillpath.gcode.slicers.retiming import Retiming
@@ -61,7 +61,7 @@ from stillpath.pipeline.result import PutBack, Result, StageTime
 from stillpath.pipeline.selection import Selection, TooLarge
 from stillpath.pipeline.summary import Summary
 from stillpath.pipeline.totals import Totals
-from stillpath.pipeline.verbatim import flowing_s, plan_verbatim, switching_s, takes_s
+from stillpath.pipeline.verbatim import flowing_s, plan_verbatim, stops_in, switching_s, takes_s
 from stillpath.pipeline.verifying import Verifier
 
 if TYPE_CHECKING:
@@ -73,6 +73,7 @@ _SAID = (Unfit, GcodeError, DesignError, ModelError)
 """Errors whose message tells the user why a piece cannot be compensated."""
 _FAULTS = (*_SAID, ArithmeticError, AssertionError, LookupError, TypeError, ValueError)
 """These and our own bugs: only the piece concerned stays as sliced."""
+_PLANNED = (Piece, LeftOut)
 _CHOSEN, _COMPENSATED = 0.2, 0.99
 """Shares of the work done when the speeds are chosen, and when the last piece is compensated."""
 
@@ -120,7 +121,8 @@ class Job:
         machine, options = order.machine, order.options
         self._order, self._layers = order, layers
         self.compensated: list[tuple[int, int]] = []
-        self._previous: VerbatimPart | None = None
+        self._kept: VerbatimPart | None = None
+        """The part before, if it was written as sliced."""
         self._source, self._target = source, target
         self._machine, self._options = machine, options
         self._reports = ProgressReports(order.progress)
@@ -218,7 +220,6 @@ class Job:
                 self._piece(item)
             else:
                 self._verbatim(item)
-            self._previous = item
             self._operation.passed(item.moves)
             # Not source.tell(): a whole block is read before its first piece is compensated.
             share = (item.text_offset + len(item.text)) / size
@@ -275,11 +276,9 @@ class Job:
     def _selected(self) -> Iterator[Piece | VerbatimPart]:
         previous: VerbatimPart | None = None
         for item in FileParts(self._source, self._reader, self._splitter, self._clock):
-            if isinstance(item, Piece) and not isinstance(previous, Piece):
-                # The sliced file does not stop in front of it.
-                with self._clock.stage("plan"):
-                    alone_s = flowing_s(None, item, self._machine)
-                    self._sum.original_s += flowing_s(previous, item, self._machine) - alone_s
+            with self._clock.stage("plan"):
+                # The sliced file does not stop between them.
+                self._sum.original_s -= self._gained_s(previous, item)
             previous = item
             before_s, names = self._sum.original_s, self._reader.feature_names
             yield from self._clock.each("plan", self._selection.divide(item, names))
@@ -315,6 +314,7 @@ class Job:
             self._put_back(piece, reason)
             return
         self.compensated.append(lines)
+        self._kept = None
         self._work.compensator.commit()
         # The last sample of an item is the first one of the next.
         written = part_of(attempt.motion, 0, len(attempt.motion) - 1)
@@ -338,7 +338,7 @@ class Job:
         lines = self._writer.leading(piece, self._checker.extruder_mm)
         blocks = self._checker.snapshot().push(lines) if lines else []
         seconds = switching_s(blocks)
-        seconds += sum(flowing_s(self._previous, b, self._machine) for b in blocks if len(b.moves))
+        seconds += sum(flowing_s(self._kept, b, self._machine) for b in blocks if len(b.moves))
         self._motion.wait(seconds)
         return seconds
 
@@ -407,6 +407,9 @@ class Job:
                 blocks = self._checker.push(text)
             # Our own lines can also add standstill, or lengthen the file's.
             self._motion.wait(switching_s(blocks) - switching_s([verbatim]))
+            if stops_in(blocks) == stops_in([verbatim]):
+                self._sum.time_s -= self._gained_s(self._kept, verbatim)
+            self._kept = verbatim
         self._emit(text, verbatim, self.delay_s)
         self._sum.moves += len(verbatim.moves)
         self._sum.newline = verbatim.text.endswith(b"\n") if verbatim.text else self._sum.newline
@@ -419,6 +422,16 @@ class Job:
         with self._clock.stage("measure"):
             for part in parts:
                 self._motion.pass_by(verbatim, part)
+
+    def _gained_s(self, before: VerbatimPart | None, after: VerbatimPart) -> float:
+        """Return how much sooner a part ends if the motion flows into it from the one before.
+
+        Parts that are verbatim in the sliced file as well count alike in both times: 0.
+        """
+        if before is None or not any(isinstance(part, _PLANNED) for part in (before, after)):
+            return 0.0
+        alone_s = flowing_s(None, after, self._machine)
+        return alone_s - flowing_s(before, after, self._machine)
 
     def _check_end(self, item: VerbatimPart, seconds: float) -> None:
         lines: Moves | Events = item.moves if len(item.moves) else item.events
