@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 import io
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
@@ -28,7 +28,7 @@ from stillpath.gcode.plan import plan_moves
 from stillpath.gcode.slicers.facts import SlicerFacts
 from stillpath.gcode.slicers.retiming import Retiming
 from stillpath.gcode.splitter import Splitter
-from stillpath.gcode.types import Events, Moves, Phases
+from stillpath.gcode.types import Events, Moves, Phases, ProgramBlock
 from stillpath.models.errors import ModelError
 from stillpath.pipeline.caution import caution_for
 from stillpath.pipeline.clock import StageClock
@@ -61,7 +61,14 @@ from stillpath.pipeline.result import PutBack, Result, StageTime
 from stillpath.pipeline.selection import Selection, TooLarge
 from stillpath.pipeline.summary import Summary
 from stillpath.pipeline.totals import Totals
-from stillpath.pipeline.verbatim import flowing_s, plan_verbatim, stops_in, switching_s, takes_s
+from stillpath.pipeline.verbatim import (
+    Restarts,
+    flowing_s,
+    plan_verbatim,
+    stops_in,
+    switching_s,
+    takes_s,
+)
 from stillpath.pipeline.verifying import Verifier
 
 if TYPE_CHECKING:
@@ -130,6 +137,8 @@ class Job:
         self._changes = options.method != "none"
         self._sum = Totals()
         self._adapter = adapter(machine)
+        self._sliced = Restarts(self._adapter.restart_s)
+        self._restarts = copy.copy(self._sliced)
         if self._changes and self._adapter.refusal is not None:
             raise ModelError(f"{machine.name} cannot execute this file: {self._adapter.refusal}")
         self._design(order.cache_dir or default_cache_dir())
@@ -278,7 +287,10 @@ class Job:
         for item in FileParts(self._source, self._reader, self._splitter, self._clock):
             with self._clock.stage("plan"):
                 # The sliced file does not stop between them.
-                self._sum.original_s -= self._gained_s(previous, item)
+                late_s = self._sliced.after([item]) - self._gained_s(previous, item)
+            self._sum.original_s += late_s
+            if self._budget is not None:
+                self._budget.passed(late_s)
             previous = item
             before_s, names = self._sum.original_s, self._reader.feature_names
             yield from self._clock.each("plan", self._selection.divide(item, names))
@@ -315,6 +327,7 @@ class Job:
             return
         self.compensated.append(lines)
         self._kept = None
+        self._restarts.after([piece])
         self._work.compensator.commit()
         # The last sample of an item is the first one of the next.
         written = part_of(attempt.motion, 0, len(attempt.motion) - 1)
@@ -340,7 +353,10 @@ class Job:
         seconds = switching_s(blocks)
         seconds += sum(flowing_s(self._kept, b, self._machine) for b in blocks if len(b.moves))
         self._motion.wait(seconds)
-        return seconds
+        restarts = copy.copy(self._restarts)
+        restart_s = restarts.after(blocks) + restarts.after([piece], from_rest=True)
+        self._sum.time_s += restart_s
+        return seconds + restart_s
 
     def _attempt(self, piece: Piece, paced: Piece) -> Attempt:
         """Compensate and write a piece at a pace and read it back; or leave everything as it was.
@@ -401,6 +417,7 @@ class Job:
 
     def _verbatim(self, verbatim: VerbatimPart) -> None:
         text = verbatim.text
+        blocks: Sequence[VerbatimPart | ProgramBlock] = [verbatim]
         if self._changes:
             text = self._writer.verbatim(verbatim, self._checker.extruder_mm)
             with self._clock.stage("read back"):
@@ -410,6 +427,7 @@ class Job:
             if stops_in(blocks) == stops_in([verbatim]):
                 self._sum.time_s -= self._gained_s(self._kept, verbatim)
             self._kept = verbatim
+        self._sum.time_s += self._restarts.after(blocks)
         self._emit(text, verbatim, self.delay_s)
         self._sum.moves += len(verbatim.moves)
         self._sum.newline = verbatim.text.endswith(b"\n") if verbatim.text else self._sum.newline

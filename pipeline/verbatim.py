@@ -13,7 +13,7 @@ from stillpath.gcode.plan import plan_moves
 from stillpath.gcode.types import EventKind, Moves, Phases, ProgramBlock, joined, rows_of
 from stillpath.models.machine import Machine
 
-__all__ = ["flowing_s", "plan_verbatim", "stops_in", "switching_s", "takes_s"]
+__all__ = ["Restarts", "flowing_s", "plan_verbatim", "stops_in", "switching_s", "takes_s"]
 
 _LAST_S = 2.0
 """What a piece does earlier has no effect on how it ends."""
@@ -91,6 +91,30 @@ def _first_moves(after: VerbatimPart | ProgramBlock) -> Moves:
     else:
         ends = after.events.move_index[stops(after.events)]
     return rows_of(after.moves, slice(0, int(ends[0]) if len(ends) else None))
+
+
+class Restarts:
+    """Count how long a firmware waits after stops before it moves again."""
+
+    def __init__(self, restart_s: float) -> None:
+        self._restart_s = restart_s
+        self._moved = self._stands = False
+
+    def after(
+        self, parts: Iterable[VerbatimPart | ProgramBlock], *, from_rest: bool = False
+    ) -> float:
+        """Return how long it waits in the lines that follow [s], which may begin `from_rest`."""
+        count, self._stands = 0, self._stands or from_rest
+        for part in parts:
+            first = part.first_move if isinstance(part, ProgramBlock) else 0
+            rests = set((part.events.move_index[stops(part.events)] - first).tolist())
+            if self._stands:
+                rests.add(0)
+            end = len(part.moves)
+            self._stands = end in rests
+            count += len(rests) - (end in rests) - (0 in rests and end > 0 and not self._moved)
+            self._moved = self._moved or end > 0
+        return self._restart_s * count
 
 
 def stops_in(parts: Iterable[VerbatimPart | ProgramBlock]) -> int:

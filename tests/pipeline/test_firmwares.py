@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from stillpath.gcode.firmware.registry import adapter
 from stillpath.models.errors import ModelError
 from stillpath.models.store import load_machine
 from stillpath.pipeline.compensate import compensate_file
@@ -60,7 +61,10 @@ def test_compensated(kind: str, beside_a_rest: bytes, tmp_path: Path, cache: Pat
     rms = {c.name: c.extruding.contour_rms_um for c in result.channels}
     assert rms["after"] < 0.6 * min(rms["before"], rms["shaper"])
     # Marlin starts each stretch with a slow step: 11.05 s of print take .08 s longer.
-    assert result.time_s == pytest.approx(result.original_time_s, rel=7.2e-3)
+    # RepRapFirmware waits before each stretch, where the sliced file does not always stop.
+    waits_s = result.pieces * adapter(machine).restart_s
+    late_s = result.time_s - result.original_time_s
+    assert abs(late_s) < 7.2e-3 * result.original_time_s + waits_s
     assert result.filament_error_mm < 1e-2
 
 

@@ -71,15 +71,18 @@ def test_what_is_sliced_does_not_stop_before_a_piece(tmp_path: Path, cache: Path
 
 
 @pytest.mark.parametrize("where", ["all", "walls"])
-@pytest.mark.parametrize("kind", ["klipper", "marlin"])
+@pytest.mark.parametrize("kind", ["klipper", "marlin", "reprapfirmware"])
 def test_times_are_those_of_both_files(kind: str, where: str, tmp_path: Path, cache: Path) -> None:
-    """Hops along slopes stay as sliced: the sliced file flows into them, and out of them again."""
+    """Hops along slopes stay as sliced: the sliced file flows into them, and out of them again.
+
+    RepRapFirmware waits for more moves wherever it begins to move again.
+    """
     hop = "G1 X134 Y101 Z{0:.1f} F9000\nG1 X120 Y100\nG1 Z{1:.1f}\n"
     walls = [
         f";TYPE:{'WALL-INNER' if k % 2 else 'WALL-OUTER'}\n{LAYER}\n{hop.format(0.6 + z, z)}"
         for k, z in enumerate(np.arange(0.4, 2.0, 0.2))
     ]
-    text = f"{HEAD}G1 X120 Y100 Z.2 F6000\n{''.join(walls)}".encode()
+    text = HEAD + "G1 X120 Y100 Z.2 F6000\n" + "M400\n".join(walls)
     machine = ender3_with(kind)
     result, _ = compensated(text, tmp_path, cache, machine, where=where)
     assert result.pieces >= 4
