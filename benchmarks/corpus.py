@@ -16,6 +16,8 @@ import tempfile
 import time
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
 from stillpath.gcode.errors import GcodeError
 from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine
@@ -35,6 +37,8 @@ def main() -> int:
     document["firmware"] |= json.loads(arguments.facts)
     machine = Machine.model_validate(document)
     names = [n for n in corpus_files() if not arguments.names or _named(n, arguments.names)]
+    if not names:
+        sys.exit("no shared data (set STILLPATH_SHARED), or no file of that name in it")
     print(f"{machine.name}, {machine.firmware.kind}, method {arguments.method}")
     print(f"{'file':44} {'pieces':>6} {'back':>5} {'print s':>8} {'CPU s':>6}  outcome")
     missed = 0

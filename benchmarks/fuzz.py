@@ -31,6 +31,8 @@ if "--bounds-check" in sys.argv:
     os.environ["NUMBA_BOUNDSCHECK"] = "1"
     os.environ["NUMBA_CACHE_DIR"] = str(Path(tempfile.gettempdir()) / "stillpath-bounds-numba")
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
 from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine
 from tests.fuzz.checks import roomy, walk

@@ -25,6 +25,8 @@ import time
 from multiprocessing.connection import Connection
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
 from stillpath.gcode.errors import GcodeError
 from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine

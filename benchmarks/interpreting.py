@@ -45,9 +45,10 @@ def main() -> None:
         data = _text(arguments.files[0])
         print(json.dumps(_measure(arguments.row, data, arguments.megabytes, arguments.machine)))
         return
-    files = arguments.files or [
-        shared_folder() / "corpus" / "own" / f"{name}.gcode.gz" for name in FILES
-    ]
+    shared = shared_folder()
+    if not arguments.files and shared is None:
+        sys.exit("no shared data: name files, or set STILLPATH_SHARED")
+    files = arguments.files or [shared / "corpus" / "own" / f"{name}.gcode.gz" for name in FILES]
     for path in files:
         print(f"\n{path.name}")
         print(f"{'':24}{'MB/s':>8}{'M lines/s':>11}{'M moves/s':>11}{'peak MB':>9}")

@@ -177,7 +177,7 @@ def budget_line(budget: BudgetFigures) -> str:
         for one in budget.classes
     )
     return (
-        f"budget {budget.budget_um:g} µm: {100 * budget.saved_share:.1f} % less time, {against}; "
+        f"budget {budget.budget_um:g} µm: {budget.against_sliced} the sliced file, {against}; "
         f"accelerations: {classes}"
     )
 

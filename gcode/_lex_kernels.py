@@ -259,7 +259,7 @@ def run(buf: Any, stop: int, f: Any, i: Any, w: Any, rows: Any, tables: Any) -> 
             else:
                 i[I_END] = min(p + 1, stop)
                 if _MOVE <= action <= _LAST_MOVE:
-                    if action == _MOVE and mask & i[I_ODD_WORDS]:
+                    if mask & i[I_ODD_WORDS]:
                         return HANDBACK
                     i[I_MOTION] = action - _MOVE + 1 if action > _MOVE else 1
                 if action == _MOVE:

@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from stillpath.gcode.state import MachineState
 
 __all__ = [
+    "FURTHER_WORDS",
     "NEEDED",
     "Action",
     "ArcRule",
@@ -63,6 +64,8 @@ Word: TypeAlias = "EventKind | Action | Handler"
 Python handler."""
 
 _TABLE_SIZE = 1024
+FURTHER_WORDS = "ABCDSUVW"
+"""Letters of a move's other axes, and of a laser's power: a stream cannot say them."""
 NEEDED: Mapping[str, str] = MappingProxyType(
     # Words whose numbers the kernel's commands need.
     {
@@ -148,7 +151,7 @@ class Dialect:
     tool_at_start: bool = True
     """Tool 0 is in use before the first T."""
     odd_words: str = ""
-    """Letters that make a move (G0 to G3) something special."""
+    """Letters that make a move (G0, G1) something special."""
     odd_move: Handler | None = None
     """Executes such a move; returns -1 if it is an ordinary one."""
     needed: Mapping[str, str] = field(default_factory=lambda: NEEDED)
@@ -202,7 +205,8 @@ class Dialect:
         i[I_ONE_COMMAND] = self.one_command
         i[I_MODAL_WORDS] = self.modal_words
         i[I_FOLD_CASE] = self.fold_case
-        i[I_ODD_WORDS] = sum(1 << (ord(letter) - 65) for letter in self.odd_words)
+        odd = self.odd_words + FURTHER_WORDS
+        i[I_ODD_WORDS] = sum(1 << (ord(letter) - 65) for letter in odd)
 
 
 def words(text: str, word: Word) -> dict[str, Word]:

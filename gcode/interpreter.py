@@ -24,7 +24,7 @@ from stillpath.gcode.dialect import Action, Dialect
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.dialects import dialect_of
 from stillpath.gcode.firmware.registry import adapter
-from stillpath.gcode.lexer import Command, check_line_ends, odd_numbers, split_line
+from stillpath.gcode.lexer import Command, check_line_ends, further_words, odd_numbers, split_line
 from stillpath.gcode.meta import META_WORDS, held_back, meta_command
 from stillpath.gcode.state import MachineState, nobody
 from stillpath.gcode.types import KEPT, EventKind, Events, Limits, ModalState, Moves, ProgramBlock
@@ -374,7 +374,24 @@ class Interpreter:
                 value = sum(state.number(v, "E", command) for v in command.words["E"].split(":"))
             state.w[ord(letter) - 65] = value
             mask |= 1 << (ord(letter) - 65)
+        more = further_words(command) if Action.MOVE <= action <= Action.ARC_CCW else ""
+        if more:
+            state.warn(f"moves of other axes, extruders or lasers ({more}) stay as sliced")
+            return self._as_it_is(action, mask)
         return execute(int(action), state.w, mask, state.f, state.i, state.rows, state.tables)
+
+    def _as_it_is(self, action: Action, mask: int) -> int:
+        """Execute a move whose line must stay; where X, Y, Z and E rest, something else moves."""
+        state, i = self.state, self.state.i
+        kept, events = int(i[at.I_KEPT]), int(i[at.I_EVENTS])
+        state.settle()
+        i[at.I_KEPT] = KEPT
+        status = execute(int(action), state.w, mask, state.f, i, state.rows, state.tables)
+        state.settle()
+        i[at.I_KEPT] = kept
+        if i[at.I_EVENTS] > events and state.rows.tiny[at.E_KIND, events] == EventKind.MODE:
+            state.rows.tiny[at.E_KIND, events] = EventKind.STOP
+        return int(status)
 
     def _several(self, commands: list[Command]) -> int:
         """Execute the commands of one line, which stays whole, so its moves are not replaced.

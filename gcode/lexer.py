@@ -15,13 +15,14 @@ from dataclasses import dataclass
 from functools import lru_cache
 from types import MappingProxyType
 
-from stillpath.gcode.dialect import Dialect
+from stillpath.gcode.dialect import FURTHER_WORDS, Dialect
 from stillpath.gcode.errors import GcodeError
 
 __all__ = [
     "Command",
     "check_line_ends",
     "extended_parameters",
+    "further_words",
     "odd_numbers",
     "split_classic",
     "split_line",
@@ -322,6 +323,12 @@ def _pairs(text: str, name: str) -> Mapping[str, str]:
     reader.commenters = "#;"
     pairs = [word.split("=", 1) for word in reader]
     return MappingProxyType({key.upper(): value for key, value in pairs})
+
+
+def further_words(command: Command) -> str:
+    """Return the letters of a move that a stream, of X, Y, Z and one E, would lose."""
+    found = command.words.items()
+    return ", ".join(k for k, text in found if ":" in text or (text and k in FURTHER_WORDS))
 
 
 def odd_numbers(command: Command) -> Iterator[tuple[str, str]]:

@@ -300,8 +300,10 @@ class MachineState:
             value = command.words[letter]
             if self.dialect.bad_words_pass and not value:
                 continue
-            # A list of numbers stands for several extruders; the first is the one in use.
-            found[letter] = self.number(value.split(":", 1)[0], letter, command)
+            if not self.dialect.extended_commands:
+                # A list of numbers stands for several extruders; the first is the one in use.
+                value = value.split(":", 1)[0]
+            found[letter] = self.number(value, letter, command)
         return found
 
     def at_least(self, value: str, key: str, low: float, command: Command) -> float:

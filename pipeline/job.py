@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 import io
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
@@ -23,12 +23,12 @@ from stillpath.gcode.firmware.planning import join_phases
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.firmware.writing import StreamWriter
 from stillpath.gcode.interpreter import Interpreter
-from stillpath.gcode.pieces import Piece, VerbatimPart
+from stillpath.gcode.pieces import LeftOut, Piece, VerbatimPart
 from stillpath.gcode.plan import plan_moves
 from stillpath.gcode.slicers.facts import SlicerFacts
 from stillpath.gcode.slicers.retiming import Retiming
 from stillpath.gcode.splitter import Splitter
-from stillpath.gcode.types import Events, Moves, Phases
+from stillpath.gcode.types import Events, Moves, Phases, ProgramBlock
 from stillpath.models.errors import ModelError
 from stillpath.pipeline.caution import caution_for
 from stillpath.pipeline.clock import StageClock
@@ -61,7 +61,14 @@ from stillpath.pipeline.result import PutBack, Result, StageTime
 from stillpath.pipeline.selection import Selection, TooLarge
 from stillpath.pipeline.summary import Summary
 from stillpath.pipeline.totals import Totals
-from stillpath.pipeline.verbatim import flowing_s, plan_verbatim, switching_s, takes_s
+from stillpath.pipeline.verbatim import (
+    Restarts,
+    flowing_s,
+    plan_verbatim,
+    stops_in,
+    switching_s,
+    takes_s,
+)
 from stillpath.pipeline.verifying import Verifier
 
 if TYPE_CHECKING:
@@ -73,6 +80,7 @@ _SAID = (Unfit, GcodeError, DesignError, ModelError)
 """Errors whose message tells the user why a piece cannot be compensated."""
 _FAULTS = (*_SAID, ArithmeticError, AssertionError, LookupError, TypeError, ValueError)
 """These and our own bugs: only the piece concerned stays as sliced."""
+_PLANNED = (Piece, LeftOut)
 _CHOSEN, _COMPENSATED = 0.2, 0.99
 """Shares of the work done when the speeds are chosen, and when the last piece is compensated."""
 
@@ -120,7 +128,8 @@ class Job:
         machine, options = order.machine, order.options
         self._order, self._layers = order, layers
         self.compensated: list[tuple[int, int]] = []
-        self._previous: VerbatimPart | None = None
+        self._kept: VerbatimPart | None = None
+        """The part before, if it was written as sliced."""
         self._source, self._target = source, target
         self._machine, self._options = machine, options
         self._reports = ProgressReports(order.progress)
@@ -128,6 +137,8 @@ class Job:
         self._changes = options.method != "none"
         self._sum = Totals()
         self._adapter = adapter(machine)
+        self._sliced = Restarts(self._adapter.restart_s)
+        self._restarts = copy.copy(self._sliced)
         if self._changes and self._adapter.refusal is not None:
             raise ModelError(f"{machine.name} cannot execute this file: {self._adapter.refusal}")
         self._design(order.cache_dir or default_cache_dir())
@@ -218,7 +229,6 @@ class Job:
                 self._piece(item)
             else:
                 self._verbatim(item)
-            self._previous = item
             self._operation.passed(item.moves)
             # Not source.tell(): a whole block is read before its first piece is compensated.
             share = (item.text_offset + len(item.text)) / size
@@ -275,11 +285,12 @@ class Job:
     def _selected(self) -> Iterator[Piece | VerbatimPart]:
         previous: VerbatimPart | None = None
         for item in FileParts(self._source, self._reader, self._splitter, self._clock):
-            if isinstance(item, Piece) and not isinstance(previous, Piece):
-                # The sliced file does not stop in front of it.
-                with self._clock.stage("plan"):
-                    alone_s = flowing_s(None, item, self._machine)
-                    self._sum.original_s += flowing_s(previous, item, self._machine) - alone_s
+            with self._clock.stage("plan"):
+                # The sliced file does not stop between them.
+                late_s = self._sliced.after([item]) - self._gained_s(previous, item)
+            self._sum.original_s += late_s
+            if self._budget is not None:
+                self._budget.passed(late_s)
             previous = item
             before_s, names = self._sum.original_s, self._reader.feature_names
             yield from self._clock.each("plan", self._selection.divide(item, names))
@@ -315,6 +326,8 @@ class Job:
             self._put_back(piece, reason)
             return
         self.compensated.append(lines)
+        self._kept = None
+        self._restarts.after([piece])
         self._work.compensator.commit()
         # The last sample of an item is the first one of the next.
         written = part_of(attempt.motion, 0, len(attempt.motion) - 1)
@@ -338,9 +351,12 @@ class Job:
         lines = self._writer.leading(piece, self._checker.extruder_mm)
         blocks = self._checker.snapshot().push(lines) if lines else []
         seconds = switching_s(blocks)
-        seconds += sum(flowing_s(self._previous, b, self._machine) for b in blocks if len(b.moves))
+        seconds += sum(flowing_s(self._kept, b, self._machine) for b in blocks if len(b.moves))
         self._motion.wait(seconds)
-        return seconds
+        restarts = copy.copy(self._restarts)
+        restart_s = restarts.after(blocks) + restarts.after([piece], from_rest=True)
+        self._sum.time_s += restart_s
+        return seconds + restart_s
 
     def _attempt(self, piece: Piece, paced: Piece) -> Attempt:
         """Compensate and write a piece at a pace and read it back; or leave everything as it was.
@@ -401,12 +417,17 @@ class Job:
 
     def _verbatim(self, verbatim: VerbatimPart) -> None:
         text = verbatim.text
+        blocks: Sequence[VerbatimPart | ProgramBlock] = [verbatim]
         if self._changes:
             text = self._writer.verbatim(verbatim, self._checker.extruder_mm)
             with self._clock.stage("read back"):
                 blocks = self._checker.push(text)
             # Our own lines can also add standstill, or lengthen the file's.
             self._motion.wait(switching_s(blocks) - switching_s([verbatim]))
+            if stops_in(blocks) == stops_in([verbatim]):
+                self._sum.time_s -= self._gained_s(self._kept, verbatim)
+            self._kept = verbatim
+        self._sum.time_s += self._restarts.after(blocks)
         self._emit(text, verbatim, self.delay_s)
         self._sum.moves += len(verbatim.moves)
         self._sum.newline = verbatim.text.endswith(b"\n") if verbatim.text else self._sum.newline
@@ -419,6 +440,16 @@ class Job:
         with self._clock.stage("measure"):
             for part in parts:
                 self._motion.pass_by(verbatim, part)
+
+    def _gained_s(self, before: VerbatimPart | None, after: VerbatimPart) -> float:
+        """Return how much sooner a part ends if the motion flows into it from the one before.
+
+        Parts that are verbatim in the sliced file as well count alike in both times: 0.
+        """
+        if before is None or not any(isinstance(part, _PLANNED) for part in (before, after)):
+            return 0.0
+        alone_s = flowing_s(None, after, self._machine)
+        return alone_s - flowing_s(before, after, self._machine)
 
     def _check_end(self, item: VerbatimPart, seconds: float) -> None:
         lines: Moves | Events = item.moves if len(item.moves) else item.events

@@ -184,7 +184,7 @@ class BudgetFigures(_Figures):
     budget_um: float
     """Contour error that every feature may have [um]."""
     saved_share: float
-    """Part of the original's print time that is saved."""
+    """Part of the original's print time that is saved; below 0: it takes longer."""
     shaper_time_s: float | None
     """How long the print takes with the best firmware shaper instead, as quick as the same budget
     allows [s]; null where it cannot keep the budget."""
@@ -194,13 +194,21 @@ class BudgetFigures(_Figures):
     """By class of moves."""
 
     @property
+    def against_sliced(self) -> str:
+        """How the time compares with that of the sliced file, in words."""
+        return _compared(self.saved_share)
+
+    @property
     def against_shaper(self) -> str:
         """How the time compares with that of the best shaper, in words."""
-        percent = f"{100 * abs(self.saved_share_against_shaper or 0.0):.1f}"
-        if percent == "0.0":
-            return "the same as"
-        less = (self.saved_share_against_shaper or 0.0) > 0
-        return f"{percent} % {'less' if less else 'more'} than"
+        return _compared(self.saved_share_against_shaper or 0.0)
+
+
+def _compared(saved_share: float) -> str:
+    percent = f"{100 * abs(saved_share):.1f}"
+    if percent == "0.0":
+        return "the same as"
+    return f"{percent} % {'less' if saved_share > 0 else 'more'} than"
 
 
 class AdvisedShaper(_Figures):

@@ -53,3 +53,35 @@ def test_it_runs(command: list[str]) -> None:
     )
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
     assert "MISS" not in done.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "script",
+    sorted(p.name for p in ROOT.glob("benchmarks/*.py") if "from tests." in p.read_text("utf-8")),
+)
+def test_it_finds_what_it_imports(script: str, tmp_path: Path) -> None:
+    """As docs/benchmarks.md says it: by its path, with nothing set."""
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "benchmarks" / script), "--help"],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+
+
+@pytest.mark.parametrize("script", ["corpus.py", "interpreting.py"])
+def test_it_says_that_the_shared_data_are_not_there(script: str, tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "benchmarks" / script)],
+        env={**os.environ, "STILLPATH_SHARED": str(tmp_path / "none")},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 1
+    assert done.stderr.startswith("no shared data")

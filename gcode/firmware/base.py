@@ -264,6 +264,13 @@ class FirmwareAdapter(Protocol):
     def extruder_alone_stops(self) -> bool:
         """X, Y and Z always come to rest before a move of the extruder alone, and after it."""
 
+    @property
+    def restart_s(self) -> float:
+        """How long the firmware waits after a stop before it moves again.
+
+        A plan from rest to rest leaves it out.
+        """
+
     def initial_limits(self) -> Limits:
         """Limits before the first line of a file."""
 

@@ -550,4 +550,6 @@ def test_what_is_no_number_is_told_where_it_is_read_all_the_same(
 def test_numbers_of_all_kinds_are_numbers(read) -> None:
     lines = "G1 X+1.5 Y.5 F600\nG1X1Y2*33\nG1 X 5 Y5.\nG1 X5 ; X1.2.3\nG0 X-.5(Y1.1.1)\n"
     assert read(lines, "marlin-loose")[1].warnings == []
-    assert read("M83\nG1 X1e1 E1:2 F600\n", "reprapfirmware")[1].warnings == []
+    assert read("M83\nG1 X1e1 E1 F600\n", "reprapfirmware")[1].warnings == []
+    of_two = "line 2: moves of other axes, extruders or lasers (E) stay as sliced"
+    assert read("M83\nG1 X1e1 E1:2 F600\n", "reprapfirmware")[1].warnings == [of_two]

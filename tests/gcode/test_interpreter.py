@@ -132,6 +132,7 @@ def test_quarter_arc_and_circle(golden_machine: Machine) -> None:
     [
         ("G20", "inches"),
         ("G1 X1..2", "not a number"),
+        ("G1 X1 E1:2", "not a number"),
         ("G1 X", "not a number"),
         ("G1 X5 F0", "feedrate"),
         ("G1 X1001", "X 1001.000 mm lies outside.*1000.000"),

@@ -309,6 +309,38 @@ def test_off_holds_until_the_end_and_through_homing(machine):
     assert [piece.text for piece in pieces_of(data, machine)] == pieces_of_head(machine)
 
 
+def test_behind_a_tuning_tower_moves_stay_as_they_came(machine):
+    """It sets limits or a shaper in the first printing move of a height, within a stream."""
+    tower = "TUNING_TOWER COMMAND=SET_VELOCITY_LIMIT PARAMETER=ACCEL START=1500 FACTOR=100\n"
+    data = HEAD + tower + "G1 X60 Y50 F6000\nG1 X70 E1\nG1 Y60 E1\n"
+    assert [piece.text for piece in pieces_of(data, machine)] == pieces_of_head(machine)
+
+
+@pytest.mark.parametrize(
+    ("kind", "line"),
+    [
+        ("klipper", "G1 X70 A5 E.5"),
+        ("marlin", "G1 X70 U5"),
+        ("marlin", "G1 X70 S50"),
+        ("marlin", "G2 X70 I5 J0 C1 E.5"),
+        ("reprapfirmware", "G1 X70 U-5 E.5"),
+        ("reprapfirmware", "G1 X70 E.2:.3"),
+        ("reprapfirmware", "G1 U5"),
+    ],
+)
+def test_moves_that_move_more_than_a_stream_can_stay_as_they_came(kind: str, line: str) -> None:
+    machine = ender3_with(kind)
+    data = f"{HEAD}G1 Y60 E.5 F3000\n{line}\nG1 Y70 E.5\n".encode()
+    items = cut(data, machine)
+    assert text_of(items) == data
+    pieces = [item.text for item in items if isinstance(item, Piece)]
+    assert not any(line.encode() in text for text in pieces)
+    assert [text for text in pieces if b"Y" in text][-2:] == [
+        b"G1 Y60 E.5 F3000\n",
+        b"G1 Y70 E.5\n",
+    ]
+
+
 def pieces_of_head(machine: Machine) -> list[bytes]:
     return [piece.text for piece in pieces_of(HEAD, machine)]
 

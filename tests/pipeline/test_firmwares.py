@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from stillpath.gcode.firmware.registry import adapter
 from stillpath.models.errors import ModelError
 from stillpath.models.store import load_machine
 from stillpath.pipeline.compensate import compensate_file
@@ -59,9 +60,11 @@ def test_compensated(kind: str, beside_a_rest: bytes, tmp_path: Path, cache: Pat
         assert written.count(b"\nG1\nM201 X") == written.count(b"\nM201 X") > 2 * result.pieces
     rms = {c.name: c.extruding.contour_rms_um for c in result.channels}
     assert rms["after"] < 0.6 * min(rms["before"], rms["shaper"])
-    # Marlin starts each stretch with a slow step: 11 s of print take .06 s longer. And
-    # lines that end at a rest stand for some milliseconds.
-    assert result.time_s == pytest.approx(result.original_time_s, rel=8e-3)
+    # Marlin starts each stretch with a slow step, and lines that end at a rest stand for some
+    # milliseconds. RepRapFirmware waits before each stretch, where the sliced file may not stop.
+    waits_s = result.pieces * adapter(machine).restart_s
+    late_s = result.time_s - result.original_time_s
+    assert abs(late_s) < 8e-3 * result.original_time_s + waits_s
     assert result.filament_error_mm < 1e-2
 
 

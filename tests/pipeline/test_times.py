@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from stillpath.models.store import load_machine
 from stillpath.pipeline.simulate import plan_file, simulate_file
 from tests.compensating import compensated
-from tests.gcode.cutting import HEAD
+from tests.gcode.cutting import HEAD, ender3_with
 from tests.gcode.prints import polygon
 
 LAYER = "\n".join(polygon(6, 15))
@@ -67,6 +68,27 @@ def test_what_is_sliced_does_not_stop_before_a_piece(tmp_path: Path, cache: Path
     sliced, _ = compensated(text, tmp_path, cache, method="none")
     assert written.original_time_s == pytest.approx(sliced.original_time_s, abs=2e-3)
     assert written.pieces >= 8
+
+
+@pytest.mark.parametrize("where", ["all", "walls"])
+@pytest.mark.parametrize("kind", ["klipper", "marlin", "reprapfirmware"])
+def test_times_are_those_of_both_files(kind: str, where: str, tmp_path: Path, cache: Path) -> None:
+    """Hops along slopes stay as sliced: the sliced file flows into them, and out of them again.
+
+    RepRapFirmware waits for more moves wherever it begins to move again.
+    """
+    hop = "G1 X134 Y101 Z{0:.1f} F9000\nG1 X120 Y100\nG1 Z{1:.1f}\n"
+    walls = [
+        f";TYPE:{'WALL-INNER' if k % 2 else 'WALL-OUTER'}\n{LAYER}\n{hop.format(0.6 + z, z)}"
+        for k, z in enumerate(np.arange(0.4, 2.0, 0.2))
+    ]
+    text = HEAD + "G1 X120 Y100 Z.2 F6000\n" + "M400\n".join(walls)
+    machine = ender3_with(kind)
+    result, _ = compensated(text, tmp_path, cache, machine, where=where)
+    assert result.pieces >= 4
+    for name, time_s in (("in", result.original_time_s), ("out", result.time_s)):
+        planned = plan_file(tmp_path / f"{name}.gcode", tmp_path / "motion.npz", machine)
+        assert time_s == pytest.approx(planned.time_s, abs=0.02), name
 
 
 def test_plan_and_simulate_tell_the_slicers_time(tmp_path: Path, cache: Path) -> None:

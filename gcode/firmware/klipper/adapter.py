@@ -29,6 +29,7 @@ class KlipperAdapter:
     step_mm = (0.0, 0.0, 0.0, 0.0)
     shortest_move_mm = 0.0
     extruder_alone_stops = True
+    restart_s = 0.0
 
     def __init__(self, machine: Machine, firmware: Klipper) -> None:
         self._machine = machine

@@ -13,7 +13,7 @@ import numpy as np
 from stillpath.gcode import _slots as at
 from stillpath.gcode.lexer import Command
 from stillpath.gcode.state import MachineState, Saved
-from stillpath.gcode.types import EventKind
+from stillpath.gcode.types import KEPT, EventKind
 
 __all__ = [
     "acceleration",
@@ -24,6 +24,7 @@ __all__ = [
     "save_state",
     "set_retraction",
     "tool",
+    "tuning_tower",
     "velocity_limit",
 ]
 
@@ -175,6 +176,21 @@ def tool(state: MachineState, command: Command) -> int:
     kind = state.dialect.otherwise(command.name)
     state.macro_ran = state.macro_ran or kind == EventKind.UNKNOWN
     return state.event(kind)
+
+
+def tuning_tower(state: MachineState, _command: Command) -> int:
+    """TUNING_TOWER: from here on it runs a command in the first printing move of every height.
+
+    That would be within a stream, whose limits and shaper are not to be changed
+    (klippy/extras/tuning_tower.py).
+    """
+    state.warn(
+        "TUNING_TOWER changes a setting at every height; what follows stays as sliced, so that it "
+        "is that setting which is tested"
+    )
+    state.settle()
+    state.i[at.I_KEPT] = KEPT
+    return state.event(EventKind.UNKNOWN)
 
 
 def activate_extruder(state: MachineState, command: Command) -> int:

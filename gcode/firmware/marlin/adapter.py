@@ -46,6 +46,7 @@ class MarlinAdapter:
     """Adapter of a Marlin machine; see `gcode.firmware.base.FirmwareAdapter`."""
 
     extruder_alone_stops = False
+    restart_s = 0.0
 
     def __init__(self, machine: Machine, firmware: Marlin) -> None:
         self._firmware = firmware

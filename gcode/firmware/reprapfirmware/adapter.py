@@ -14,7 +14,7 @@ from stillpath.gcode.firmware.base import scaled
 from stillpath.gcode.firmware.reprapfirmware.advice import RepRapAdviser
 from stillpath.gcode.firmware.reprapfirmware.encoder import STEEPEST, RepRapEncoder, stream_limits
 from stillpath.gcode.firmware.reprapfirmware.limits import RepRapLimits
-from stillpath.gcode.firmware.reprapfirmware.planner import RepRapPlanner, on_steps
+from stillpath.gcode.firmware.reprapfirmware.planner import GRACE_S, RepRapPlanner, on_steps
 from stillpath.gcode.firmware.reprapfirmware.stream_commands import RepRapStreamCommands
 from stillpath.gcode.types import Limits
 from stillpath.models.firmware import RepRapFirmware
@@ -47,6 +47,7 @@ class RepRapAdapter:
         if machine.kinematics == "corexy":
             x = y = 0.5 * (x + y)
         self.step_mm = (x, y, z, 0.0)
+        self.restart_s = GRACE_S + firmware.prepare_ahead_s
 
     @property
     def refusal(self) -> str | None:

@@ -105,13 +105,14 @@ function features(report, channels, labels) {
 function budget(report) {
   const found = report.budget;
   if (!found) return null;
-  const saved = (/** @type {number} */ share) => `${(100 * share).toFixed(1)} %`;
-  const against = saved(Math.abs(found.saved_share_against_shaper ?? 0));
-  const compared = against === saved(0) ? "the same as" : `${against} ${found.saved_share_against_shaper > 0 ? "less" : "more"} than`;
+  const compared = (/** @type {number | null} */ share) => {
+    const percent = (100 * Math.abs(share ?? 0)).toFixed(1);
+    return percent === "0.0" ? "the same as" : `${percent} % ${(share ?? 0) > 0 ? "less" : "more"} than`;
+  };
   const shaper = found.shaper_time_s === null ? "; the best-tuned shaper cannot keep it"
-    : `, and ${compared} with the best-tuned shaper at the same budget (${duration(found.shaper_time_s)}, predicted)`;
+    : `, and ${compared(found.saved_share_against_shaper)} with the best-tuned shaper at the same budget (${duration(found.shaper_time_s)}, predicted)`;
   return section("Speed budget",
-    h("p", null, `Within a contour error of ${um(found.budget_um)} µm (rms of the worst plant of the machine's set, for every feature) the print takes ${saved(found.saved_share)} less time than the sliced file${shaper}.`),
+    h("p", null, `Within a contour error of ${um(found.budget_um)} µm (rms of the worst plant of the machine's set, for every feature) the print takes ${compared(found.saved_share)} the sliced file${shaper}.`),
     longTable("Accelerations by class of moves", [{ title: "Moves", text: true }, { title: "Accelerations" }, { title: "With the shaper", wide: true }, { title: "Contour, rms of the worst plant, µm" }], found.classes, (c) => [
       title(c), `× ${c.acceleration_factor.toFixed(2)}`, `× ${c.shaper_acceleration_factor.toFixed(2)}`, um(c.contour_rms_um)], 20));
 }
