@@ -64,7 +64,7 @@ def test_compensated(kind: str, beside_a_rest: bytes, tmp_path: Path, cache: Pat
     # milliseconds. RepRapFirmware waits before each stretch, where the sliced file may not stop.
     waits_s = result.pieces * adapter(machine).restart_s
     late_s = result.time_s - result.original_time_s
-    assert abs(late_s) < 8e-3 * result.original_time_s + waits_s
+    assert abs(late_s) < 9e-3 * result.original_time_s + waits_s
     assert result.filament_error_mm < 1e-2
 
 
