@@ -58,6 +58,7 @@ _LOST = 3
 _JUMP_MM = 0.2
 """Places that are whole motor steps are not jumps."""
 _SHAPER_REACH_S = 0.15
+_LONGER_S, _STANDING_EVERY_S, _ROUNDS = 5e-4, 1e-3, 4
 _STOPPING = np.array([int(kind) for kind in sorted(STOPPING)])
 
 
@@ -281,7 +282,8 @@ class Aligned(Timed):
 
     Both files consist of stretches of X Y motion between the same rests. A stretch of the original
     starts when the written one starts and runs in its own time; then the path stands still until
-    the next stretch starts. `original` must be planned with the written file's stops.
+    the next stretch starts. Where the written one lasts longer, the path stands for the part of
+    that time with which both are nearest. `original` must be planned with the written file's stops.
     """
 
     def __init__(self, original: Motion, written: Motion) -> None:
@@ -291,9 +293,31 @@ class Aligned(Timed):
         self._from_s = self._path.t_s[self.original_rows[0]]
         self._until_s = ends[self.original_rows[1]]
         self._begin_s = written.phases.t_s[self.written_rows[0]]
+        self._begin_s = self._begin_s + self._standing_s(written.phases.end_s)
         self._start_s = 0.0
         self._last_s = written.time_s
         self.samples = int(np.ceil(written.time_s / DT_S)) + 1
+
+    def _standing_s(self, end_s: Array) -> Array:
+        """Standing time before each stretch, by least squares between both motions."""
+        stands = np.zeros(len(self._begin_s))
+        begin_s, lasts_s = self._begin_s, self._until_s - self._from_s
+        longer_s = end_s[self.written_rows[1]] - begin_s - lasts_s
+        for k in np.flatnonzero((longer_s > _LONGER_S) & (lasts_s > _LONGER_S)):
+            t_s = np.arange(0.0, lasts_s[k] + longer_s[k] + _STANDING_EVERY_S, _STANDING_EVERY_S)
+            rows = slice(self.written_rows[0][k], self.written_rows[1][k] + 1)
+            made = _rows(self._written, rows.start, rows.stop)
+            command = sample_phases(made, begin_s[k] + t_s)[0][:2]
+            rows = slice(self.original_rows[0][k], self.original_rows[1][k] + 1)
+            plan = _rows(self._path, rows.start, rows.stop)
+            found_s = 0.5 * longer_s[k]
+            for _ in range(_ROUNDS):
+                path = sample_phases(plan, self._from_s[k] + np.maximum(t_s - found_s, 0.0))[0][:2]
+                speed = np.gradient(path, _STANDING_EVERY_S, axis=1)
+                found_s += np.sum((path - command) * speed) / max(np.sum(speed**2), 1e-12)
+                found_s = float(np.clip(found_s, 0.0, longer_s[k]))
+            stands[k] = found_s
+        return stands
 
     def sections(self, original: Motion, written: Motion) -> list[Aligned]:
         """Cut at the jumps of the written file's position."""
@@ -319,9 +343,9 @@ class Aligned(Timed):
     def path(self, first: int, last: int) -> tuple[Array, Mask]:
         t_s: Array = self._start_s + DT_S * np.arange(first, last, dtype=np.float64)
         k = np.maximum(np.searchsorted(self._begin_s, t_s, "right") - 1, 0)
-        since_s = np.maximum(t_s - self._begin_s[k], 0.0)
-        wanted_s = self._from_s[k] + since_s
-        moving = wanted_s < self._until_s[k]
+        since_s = t_s - self._begin_s[k]
+        wanted_s = self._from_s[k] + np.maximum(since_s, 0.0)
+        moving = (since_s >= 0.0) & (wanted_s < self._until_s[k])
         # Just before the end; a sample may be nearer to it than that.
         wanted_s = np.where(moving, wanted_s, self._until_s[k] - 1e-9)
         wanted_s = np.maximum.accumulate(wanted_s)

@@ -354,12 +354,7 @@ class PlantSetSpec(Document):
         return self
 
     def without_delay(self) -> PlantSetSpec:
-        """Return the set without what delays slow motion, where its plants say what that is.
-
-        Of raw logs it stays: there only their clocks show a delay, and so it is real.
-        """
-        if self.provenance is not None and self.provenance.kind == "raw log":
-            return self
+        """Return the set without what delays slow motion, where its plants say what that is."""
         if isinstance(self.members, ParametricMembers):
             members: tuple[WeightedMember, ...] | ParametricMembers = self.members
         else:

@@ -25,6 +25,7 @@ from stillpath.models.identification.types import (
     Excitation,
     FrequencyResponse,
 )
+from stillpath.models.plant_specs import RelativeModesSpec
 from stillpath.models.plants import ParametricMembers, PlantSetSpec, PlantSpec, frequency_response
 from stillpath.models.schedule import AxisSchedule
 
@@ -115,9 +116,12 @@ def timed(
     other = "X" if later == "y" else "Y"
     one = found[later]
     plants = _later(one.plants, later_s, 2.0 * sd_s * math.sqrt(share))
+    # Leading by it where modes are damped against each other made two of four virtual printers
+    # better and two worse (docs/tried.md).
+    what = "ranges" if isinstance(plants.nominal, RelativeModesSpec) else "commands"
     note = (
         f"by the clocks of the logs the axis follows {1e3 * delay_of(plants.nominal):.2f} ms later "
-        f"than {other}: commands allow for it"
+        f"than {other}: {what} allow for it"
     )
     schedule = _later_places(one.schedule, later_s)
     notes = (*one.notes, note)
