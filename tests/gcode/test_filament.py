@@ -59,7 +59,8 @@ CASES = {
         "G1 X90.598 Y90.045 E.015"
     ),
     "E relative and scaled, then absolute": (
-        "M221 S80\nM83\nG1 X60 E1\nG1 E1\nG1 Y60 E.5\nM82\nG1 X90 E0 F3000\nG1 Y80 E3\nM400\nG1 Y60 E4"
+        "M221 S80\nM83\nG1 X60 E1\nG1 E1\nG1 Y60 E.5\nM82\nG1 X90 E0 F3000\nG1 Y80 E3\n"
+        "M400\nG1 Y60 E4"
     ),
     "M220 is not for the extruder alone": "M220 S80\nG1 X60 E2.2\nG1 E-1\nG1 Y60 E1\nG1 E1\nM400",
 }
