@@ -101,8 +101,8 @@ def test_retractions_far_from_zero_do_not_drift(decimals: int, cache: Path) -> N
     before, after = (
         read(d, "marlin").extruded_mm[0] for d in (text.encode(), check(text, "marlin", cache))
     )
-    # Roundings of single segments remain, and add up by chance.
-    assert after == pytest.approx(before, abs=5e-5)
+    # Roundings of single segments remain, and add up by chance: 40 nm is usual, 66 nm occurs.
+    assert after == pytest.approx(before, abs=FILAMENT_MM)
 
 
 def check(text: str, kind: str, cache: Path, *, reverts: bool = True) -> bytes:
