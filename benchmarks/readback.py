@@ -58,7 +58,7 @@ _LOST = 3
 _JUMP_MM = 0.2
 """Places that are whole motor steps are not jumps."""
 _SHAPER_REACH_S = 0.15
-_LONGER_S, _STANDING_EVERY_S, _ROUNDS = 5e-4, 1e-3, 4
+_LONGER_S, _ROUNDS = 5e-4, 4
 _STOPPING = np.array([int(kind) for kind in sorted(STOPPING)])
 
 
@@ -299,24 +299,21 @@ class Aligned(Timed):
         self.samples = int(np.ceil(written.time_s / DT_S)) + 1
 
     def _standing_s(self, end_s: Array) -> Array:
-        """Standing time before each stretch, by least squares between both motions."""
+        """Standing time before each stretch."""
         stands = np.zeros(len(self._begin_s))
         begin_s, lasts_s = self._begin_s, self._until_s - self._from_s
         longer_s = end_s[self.written_rows[1]] - begin_s - lasts_s
         for k in np.flatnonzero((longer_s > _LONGER_S) & (lasts_s > _LONGER_S)):
-            t_s = np.arange(0.0, lasts_s[k] + longer_s[k] + _STANDING_EVERY_S, _STANDING_EVERY_S)
-            rows = slice(self.written_rows[0][k], self.written_rows[1][k] + 1)
-            made = _rows(self._written, rows.start, rows.stop)
-            command = sample_phases(made, begin_s[k] + t_s)[0][:2]
-            rows = slice(self.original_rows[0][k], self.original_rows[1][k] + 1)
-            plan = _rows(self._path, rows.start, rows.stop)
-            found_s = 0.5 * longer_s[k]
-            for _ in range(_ROUNDS):
-                path = sample_phases(plan, self._from_s[k] + np.maximum(t_s - found_s, 0.0))[0][:2]
-                speed = np.gradient(path, _STANDING_EVERY_S, axis=1)
-                found_s += np.sum((path - command) * speed) / max(np.sum(speed**2), 1e-12)
-                found_s = float(np.clip(found_s, 0.0, longer_s[k]))
-            stands[k] = found_s
+            written, plan = (
+                _rows(phases, int(rows[0][k]), int(rows[1][k]) + 1)
+                for phases, rows in (
+                    (self._written, self.written_rows),
+                    (self._path, self.original_rows),
+                )
+            )
+            since_s = np.arange(0.0, lasts_s[k] + longer_s[k], _LONGER_S)
+            command = sample_phases(written, begin_s[k] + since_s)[0][:2]
+            stands[k] = _stands_s(plan, since_s, command, longer_s[k])
         return stands
 
     def sections(self, original: Motion, written: Motion) -> list[Aligned]:
@@ -436,6 +433,22 @@ class Judge:
     def members_rms_mm(self) -> float:
         """Mean of the members' contour rms."""
         return float(np.mean([tally.rms for tally in self.members]))
+
+
+def _stands_s(plan: Phases, since_s: Array, command: Array, most_s: float) -> float:
+    """Time for which a plan stands before it moves, by least squares to a command (2, n)."""
+
+    def path(stands_s: float) -> Array:
+        return sample_phases(plan, plan.t_s[0] + np.maximum(since_s - stands_s, 0.0))[0][:2]
+
+    found_s = 0.5 * most_s
+    for _ in range(_ROUNDS):
+        wanted = path(found_s)
+        speed = np.gradient(wanted, since_s, axis=1)
+        step_s = np.sum((wanted - command) * speed) / max(np.sum(speed**2), 1e-12)
+        found_s = float(np.clip(found_s + step_s, 0.0, most_s))
+    without, shifted = (np.sum((path(stands_s) - command) ** 2) for stands_s in (0.0, found_s))
+    return found_s if shifted < without else 0.0
 
 
 def _match(original: Motion, written: Motion) -> tuple[tuple[Ints, Ints], tuple[Ints, Ints]]:

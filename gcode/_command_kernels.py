@@ -91,9 +91,13 @@ def execute(action: int, w: Any, mask: int, f: Any, i: Any, rows: Any, tables: A
         i[I_PLANE] = action - _PLANE_XY
     elif action in (_INCHES, _MILLIMETRES):
         unit_mm = 25.4 if action == _INCHES else 1.0
-        if f[F_UNIT_MM] != unit_mm or f[F_UNIT_E_MM] != unit_mm:
+        if f[F_UNIT_MM] != unit_mm:
             kind = _STATE
-        f[F_UNIT_MM] = f[F_UNIT_E_MM] = unit_mm
+        if f[F_UNIT_E_MM] == f[F_UNIT_MM]:
+            f[F_UNIT_E_MM] = unit_mm
+        else:  # in cubic mm or inches (M200)
+            f[F_UNIT_E_MM] *= (unit_mm / f[F_UNIT_MM]) ** 3
+        f[F_UNIT_MM] = unit_mm
     elif action in (_ABSOLUTE, _RELATIVE):
         i[I_ABS_XYZ] = 1 if action == _ABSOLUTE else 0
         if i[I_E_RULE] == _MARLIN_E:

@@ -27,7 +27,7 @@ def note_comment(state: MachineState, command: Command) -> int:
         return state.event(EventKind.STAMP)
     elif kind in (MarkKind.OFF, MarkKind.ON):
         state.settle()
-        i[at.I_KEPT] = KEPT if kind == MarkKind.OFF else 0
+        i[at.I_KEPT] = KEPT if kind == MarkKind.OFF or state.tunes else 0
     elif kind == MarkKind.LAYER:
         _note_layer(state, command, text[found : found + 7], mark.text)
     elif kind == MarkKind.Z:

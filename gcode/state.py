@@ -106,6 +106,8 @@ class MachineState:
         self.factors: dict[str, float] = {}
         self.macro_ran = False
         """The file has called what may be a macro of the printer."""
+        self.tunes = False
+        """TUNING_TOWER has begun: no mark puts moves into streams again."""
         self.tool_known = dialect.tool_at_start
         self.conditional_indent = -1
         self.warnings: dict[str, int] = {}

@@ -12,6 +12,7 @@ from typing import Literal
 
 import numpy as np
 
+from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.sampler import sample_phases
 from stillpath.gcode.timeline import Group
 from stillpath.gcode.types import Phases
@@ -46,6 +47,9 @@ class Standing:
     def __init__(self, machine: Machine, dt_s: float) -> None:
         sets = [plant_set(machine.axes[axis].without_delay(), dt_s) for axis in _AXES]
         self._spring_s = np.sqrt([yielding_s2(plants.nominal) for plants in sets])
+        # Firmwares other than Klipper may begin and end lines at a speed. Time to make up for that
+        # helps none that makes moves of several motor steps: its lines creep to their ends in one.
+        self._creeps = adapter(machine).shortest_move_mm > 0.0
         self._accel = np.array([machine.command.of(axis).accel_mm_s2 for axis in _AXES])
 
     def of(self, phases: Phases, groups: list[Group]) -> tuple[Array, Array]:
@@ -53,19 +57,25 @@ class Standing:
         first = np.array([group.first for group in groups])
         last = np.array([group.last for group in groups]) - 1
         begin_s, end_s = phases.t_s[first], phases.end_s[last]
+        begin_mm_s, end_mm_s = (
+            (self._creeps * speed[:, None] * phases.direction)[rows]
+            for speed, rows in ((phases.start_mm_s, first), (phases.end_mm_s, last))
+        )
         way_mm = np.empty((2, 2, len(groups)))
         for i, spring_s in enumerate(self._spring_s):
             early_s = np.minimum(begin_s + spring_s, end_s)
             late_s = np.maximum(end_s - spring_s, begin_s)
-            for k, (from_s, to_s) in enumerate(((begin_s, early_s), (late_s, end_s))):
+            spans = (begin_s, early_s, begin_mm_s), (late_s, end_s, end_mm_s)
+            for k, (from_s, to_s, at_once_mm_s) in enumerate(spans):
                 times_s = np.maximum.accumulate(np.stack([from_s, to_s], axis=1).ravel())
                 place, _ = sample_phases(phases, times_s, flat=True)
                 way_mm[k, i] = np.diff(place[i].reshape(-1, 2), axis=1)[:, 0]
+                way_mm[k, i] -= (to_s - from_s) * at_once_mm_s[:, i]
         prints = phases.direction[:, 3] > 0.0
         return self._needed_s(way_mm[0], prints[first]), self._needed_s(way_mm[1], prints[last])
 
     def _needed_s(self, way_mm: Array, prints: Mask) -> Array:
-        """Return the time for the jumps of X and Y, which move `way_mm` within 1 / omega."""
+        """Return the time for the jumps of X and Y, which accelerate by `way_mm` in 1 / omega."""
         jump_mm = 2.0 * np.abs(way_mm)
         # Half of the way accelerating, half braking.
         needed_s = 2.0 * np.sqrt(jump_mm / self._accel[:, None]).max(axis=0)

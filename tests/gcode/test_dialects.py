@@ -171,6 +171,10 @@ CASES = {
         f"M83\nM200 D2\nG1 X1 E{math.pi} F600\n",
         same((*FAMILY, "reprapfirmware"), 1, 0, 0, 1),
     ),
+    "volumetric whatever the unit": (
+        f"M83\nM200 D2\nG20\nG21\nG1 X1 E{math.pi} F600\n",
+        same((*FAMILY, "reprapfirmware"), 1, 0, 0, 1),
+    ),
     "a line that is too long": (
         "G1 X5 F600" + " " * 90 + "Y7\n",
         {

@@ -309,10 +309,11 @@ def test_off_holds_until_the_end_and_through_homing(machine):
     assert [piece.text for piece in pieces_of(data, machine)] == pieces_of_head(machine)
 
 
-def test_behind_a_tuning_tower_moves_stay_as_they_came(machine):
+@pytest.mark.parametrize("mark", ["", "; STILLPATH_ON\n"])
+def test_behind_a_tuning_tower_moves_stay_as_they_came(machine, mark):
     """It sets limits or a shaper in the first printing move of a height, within a stream."""
     tower = "TUNING_TOWER COMMAND=SET_VELOCITY_LIMIT PARAMETER=ACCEL START=1500 FACTOR=100\n"
-    data = HEAD + tower + "G1 X60 Y50 F6000\nG1 X70 E1\nG1 Y60 E1\n"
+    data = HEAD + tower + "G1 X60 Y50 Z5 F6000\n" + mark + "G1 X70 E1\nG1 Y60 E1\n"
     assert [piece.text for piece in pieces_of(data, machine)] == pieces_of_head(machine)
 
 

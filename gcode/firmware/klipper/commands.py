@@ -190,6 +190,7 @@ def tuning_tower(state: MachineState, _command: Command) -> int:
     )
     state.settle()
     state.i[at.I_KEPT] = KEPT
+    state.tunes = True
     return state.event(EventKind.UNKNOWN)
 
 
