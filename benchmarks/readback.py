@@ -342,10 +342,11 @@ class Aligned(Timed):
         k = np.maximum(np.searchsorted(self._begin_s, t_s, "right") - 1, 0)
         since_s = t_s - self._begin_s[k]
         wanted_s = self._from_s[k] + np.maximum(since_s, 0.0)
-        moving = (since_s >= 0.0) & (wanted_s < self._until_s[k])
+        moving = wanted_s < self._until_s[k]
         # Just before the end; a sample may be nearer to it than that.
         wanted_s = np.where(moving, wanted_s, self._until_s[k] - 1e-9)
         wanted_s = np.maximum.accumulate(wanted_s)
+        moving &= since_s >= 0.0
         phases, _ = _around(self._path, wanted_s)
         position, row = sample_phases(phases, wanted_s)
         return position[:2], moving & phases.moves_xy[row] & (phases.direction[row, 3] > 0.0)
