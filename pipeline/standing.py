@@ -2,7 +2,7 @@
 
 A plan's acceleration a begins and ends there all at once. A nozzle that lags by k a behind its
 command, as springs do, follows exactly only if the command jumps by k a, and no motor can. Without
-time to make up for it, half of all the largest errors of a print lie there. So the plan stands
+time to make up for it, the largest errors of most prints lie there. So the plan stands
 still for as long as the command's acceleration needs for that jump, from rest to rest.
 """
 
