@@ -304,13 +304,11 @@ class Aligned(Timed):
         begin_s, lasts_s = self._begin_s, self._until_s - self._from_s
         longer_s = end_s[self.written_rows[1]] - begin_s - lasts_s
         for k in np.flatnonzero((longer_s > _LONGER_S) & (lasts_s > _LONGER_S)):
-            written, plan = (
-                _rows(phases, int(rows[0][k]), int(rows[1][k]) + 1)
-                for phases, rows in (
-                    (self._written, self.written_rows),
-                    (self._path, self.original_rows),
-                )
+            (a, b), (c, d) = (
+                (int(rows[0][k]), int(rows[1][k]) + 1)
+                for rows in (self.written_rows, self.original_rows)
             )
+            written, plan = _rows(self._written, a, b), _rows(self._path, c, d)
             since_s = np.arange(0.0, lasts_s[k] + longer_s[k], _LONGER_S)
             command = sample_phases(written, begin_s[k] + since_s)[0][:2]
             stands[k] = _stands_s(plan, since_s, command, longer_s[k])

@@ -59,8 +59,8 @@ CASES = {
         "G1 X90.598 Y90.045 E.015"
     ),
     "E relative and scaled, then absolute": (
-        "M221 S80\nM83\nG1 X60 E1\nG1 E1\nG1 Y60 E.5\nM82\n"
-        "G1 X90 E0 F3000\nG1 Y80 E3\nM400\nG1 Y60 E4"
+        "M221 S80\nM83\nG1 X60 E1\nG1 E1\nG1 Y60 E.5\nM82\nG1 X90 E0 F3000\nG1 Y80 E3\n"
+        "M400\nG1 Y60 E4"
     ),
     "M220 is not for the extruder alone": "M220 S80\nG1 X60 E2.2\nG1 E-1\nG1 Y60 E1\nG1 E1\nM400",
 }
@@ -101,8 +101,8 @@ def test_retractions_far_from_zero_do_not_drift(decimals: int, cache: Path) -> N
     before, after = (
         read(d, "marlin").extruded_mm[0] for d in (text.encode(), check(text, "marlin", cache))
     )
-    # Roundings of single segments remain, and add up by chance.
-    assert after == pytest.approx(before, abs=5e-5)
+    # Roundings of single segments remain, and add up by chance: 40 nm is usual, 66 nm occurs.
+    assert after == pytest.approx(before, abs=FILAMENT_MM)
 
 
 def check(text: str, kind: str, cache: Path, *, reverts: bool = True) -> bytes:
