@@ -94,9 +94,10 @@ def test_tapping_the_path_reads_it(visitor: Visitor, show: Callable[..., Page]):
     page = show(visitor, "job", viewport=PHONE, has_touch=True, is_mobile=True)
     page.get_by_role("button", name="Worst point of this layer").tap()
     page.locator(".stage").focus()
-    page.keyboard.press("Escape")
+    # Focus may have scrolled.
     spot = page.locator(".stage .mark:visible").first.bounding_box()
     assert spot is not None
+    page.keyboard.press("Escape")
     page.touchscreen.tap(spot["x"] + 8, spot["y"] + 8)
     expect(page.locator(".layers .readout")).to_contain_text("Line ")
 
