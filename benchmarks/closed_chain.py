@@ -408,7 +408,8 @@ def nominal_um(parts: Sequence[Timed], machine: Machine, seconds: float) -> floa
         path, extruding = part.path(0, n)
         path, extruding = path[:, ::step].copy(), extruding[::step]
         at = np.flatnonzero(extruding[::10]) * 10
-        received = DryFriction(machine.friction_mm).received_mm(part.command(0, n)[:, ::step])
+        friction = DryFriction(machine.friction_mm, step * DT_S)
+        received = friction.received_mm(part.command(0, n)[:, ::step])
         answer = response(pair, received)
         errors.values.append(PathDistances(path, step * DT_S, WINDOW_S).at(answer[:, at], at))
     return errors.rms_um

@@ -49,7 +49,7 @@ def against_friction(
         Length of the window that smooths reversals.
     """
     weights = window(rounded_s, dt_s)
-    bends = np.stack([smoothed(bend_of(row), weights) for row in wanted_mm])
+    bends = np.stack([smoothed(bend_of(row, dt_s), weights) for row in wanted_mm])
     added = np.array(held_mm)[:, None] * bends
     blend = max(2, round(_BLEND_S / dt_s))
     return wanted_mm + stand_still(added, np.zeros_like(added), rests, blend)

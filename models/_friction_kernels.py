@@ -13,12 +13,16 @@ _ROUNDS = 3
 
 
 @kernel(allocates=False)
-def bent(way: Array, bend: float, out: Array) -> None:
-    """Compute the bend of guides along a path from rest, -1 to 1 (Dahl 1968), exactly."""
+def bent(way: Array, bend: float, kept: float, out: Array) -> None:
+    """Compute the bend of guides along a path from rest, -1 to 1 (Dahl 1968), exactly.
+
+    A share `kept` of the bend remains from one sample to the next.
+    """
     now = 0.0
     out[0] = now
     for k in range(1, len(way)):
         step = way[k] - way[k - 1]
+        now *= kept
         if step != 0.0:
             towards = 1.0 if step > 0.0 else -1.0
             now = towards + (now - towards) * np.exp(-abs(step) / bend)
@@ -26,12 +30,15 @@ def bent(way: Array, bend: float, out: Array) -> None:
 
 
 @kernel(allocates=False)
-def received(command: Array, held: float, bend: float, state: Array, out: Array) -> None:
-    """Solve w + held bent(w) = command; `state` is (command, w, bent) of the last sample."""
-    before, w, now = state[0], state[1], state[2]
+def received(
+    command: Array, held: float, bend: float, kept: float, state: Array, out: Array
+) -> None:
+    """Solve w + held bent(w) = command; `state` is (w, bent) of the last sample."""
+    w, now = state[0], state[1]
     for k in range(len(command)):
-        step = command[k] - before
-        before = command[k]
+        now *= kept
+        # What the guides let go of moves the axis as a command does.
+        step = command[k] - (w + held * now)
         if step != 0.0:
             towards = 1.0 if step > 0.0 else -1.0
             asked, way = abs(step), 0.0
@@ -45,4 +52,4 @@ def received(command: Array, held: float, bend: float, state: Array, out: Array)
             # What three rounds leave is not lost.
             w = command[k] - held * now
         out[k] = w
-    state[0], state[1], state[2] = before, w, now
+    state[0], state[1] = w, now

@@ -8,10 +8,15 @@ pulls, so the plant G responds to the command that is left after friction:
     y = G w,    w + c s(w) = u,    |s| <= 1 the bend.
 
 No command linear in the path can compensate for that; u = w + c s(w) does.
+
+Where an axis stands while the other moves, what still vibrates lets its guides creep until they are
+straight (Dahl's own model does so; a guide in a vibrating machine hardly rubs). So s decays within
+`CREEP_S`, and the command returns to the path.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -19,18 +24,26 @@ import numpy as np
 from stillpath.models._friction_kernels import bent, received
 from stillpath.models.arrays import Array
 
-__all__ = ["BEND_MM", "DryFriction", "bend_of"]
+__all__ = ["BEND_MM", "CREEP_S", "DryFriction", "bend_of"]
 
 BEND_MM = 0.01
 """Travel over which friction reverses: 5 to 20 um on rolling and sliding guides. Half or twice as
 much changes contour errors by a few per cent."""
+CREEP_S = 0.05
+"""Time constant of a bend while an axis stands. 0.03 and 0.1 are about as good (docs/tried.md)."""
 
 
-def bend_of(way_mm: Array) -> Array:
-    """Return s along a path from rest, shape (n,)."""
+def bend_of(way_mm: Array, dt_s: float = 0.0) -> Array:
+    """Return s along a path from rest, shape (n,).
+
+    Parameters
+    ----------
+    dt_s : float
+        Between samples; 0: guides do not creep, as in a test in which an axis never stands.
+    """
     out = np.empty(len(way_mm))
     if len(out):
-        bent(np.ascontiguousarray(way_mm), BEND_MM, out)
+        bent(np.ascontiguousarray(way_mm), BEND_MM, _kept(dt_s), out)
     return out
 
 
@@ -41,10 +54,12 @@ class DryFriction:
     ----------
     held_mm : sequence of float
         Distance by which friction holds each axis back; 0: no friction.
+    dt_s : float
+        Between samples.
     """
 
-    def __init__(self, held_mm: Sequence[float]) -> None:
-        self._held = tuple(held_mm)
+    def __init__(self, held_mm: Sequence[float], dt_s: float) -> None:
+        self._held, self._kept = tuple(held_mm), _kept(dt_s)
         self._states: Array | None = None
 
     def __bool__(self) -> bool:
@@ -61,8 +76,12 @@ class DryFriction:
             return command_mm
         if self._states is None:
             first = command_mm[:, 0]
-            self._states = np.stack([first, first, np.zeros(len(first))], axis=1)
+            self._states = np.stack([first, np.zeros(len(first))], axis=1)
         out = np.empty(command_mm.shape)
         for row, held, state, to in zip(command_mm, self._held, self._states, out, strict=True):
-            received(np.ascontiguousarray(row), held, BEND_MM, state, to)
+            received(np.ascontiguousarray(row), held, BEND_MM, self._kept, state, to)
         return out
+
+
+def _kept(dt_s: float) -> float:
+    return math.exp(-dt_s / CREEP_S)

@@ -129,7 +129,7 @@ def unseen_friction_mm(axis: PlantSetSpec) -> float:
 def nominal_response(machine: Machine, command: Array, dt_s: float) -> Array:
     """Return the nominal plants' response to a command, dry friction included."""
     pair = [plant_set(machine.axes[axis], dt_s).nominal for axis in ("x", "y")]
-    return response(pair, _received(machine, command))
+    return response(pair, _received(machine, command, dt_s))
 
 
 def error_ranges(
@@ -154,11 +154,11 @@ def error_ranges(
         nominal = max(rms(nominal_response(machine, command, dt_s)), 1e-12)
         ratios = []
         for pair, side in zip(pairs, sides, strict=True):
-            received = _received(machine, command, 1.0 + _FRICTION_UNSURE * side)
+            received = _received(machine, command, dt_s, 1.0 + _FRICTION_UNSURE * side)
             ratios.append(rms(_delayed(response(pair, received), side * lag_s / dt_s)) / nominal)
         rubbed = nominal
         if any(unseen_mm):
-            held = DryFriction(np.add(machine.friction_mm, unseen_mm).tolist())
+            held = DryFriction(np.add(machine.friction_mm, unseen_mm).tolist(), dt_s)
             rubbed = rms(response((x.nominal, y.nominal), held.received_mm(command)))
         added = math.sqrt(max(0.0, rubbed**2 - nominal**2))
         out[name] = ErrorRange(
@@ -167,9 +167,10 @@ def error_ranges(
     return out
 
 
-def _received(machine: Machine, command: Array, share: float = 1.0) -> Array:
+def _received(machine: Machine, command: Array, dt_s: float, share: float = 1.0) -> Array:
     """Return a command after dry friction; `share` scales the measured friction."""
-    return DryFriction([share * held for held in machine.friction_mm]).received_mm(command)
+    held_mm = [share * held for held in machine.friction_mm]
+    return DryFriction(held_mm, dt_s).received_mm(command)
 
 
 def _delayed(y: Array, samples: float) -> Array:

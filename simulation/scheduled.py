@@ -50,7 +50,7 @@ class MachineStream:
         self._machine, self._dt_s = machine, dt_s
         self._member = member
         self._ripple = MachineRipple(machine.kinematics, machine.ripple)
-        self._friction = DryFriction(machine.friction_mm)
+        self._friction = DryFriction(machine.friction_mm, dt_s)
         self._grid = OperatingGrid(machine, step=SIMULATION_STEP, blend_step=BLEND_STEP)
         self._remembered = round(REMEMBERED_S / dt_s) if machine.schedules else 0
         self._past = np.zeros((2, 0))

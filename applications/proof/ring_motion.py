@@ -124,7 +124,7 @@ def read_ring_motion(printed: Path, machine: Machine) -> RingMotion:
         quiet[axis] = [(first / RATE_HZ, end / RATE_HZ) for first, end in runs(own["quiet"])]
         about[axis] = np.any(list(own.values()), axis=0)
     stops.sort(key=lambda stop: stop.at_s)
-    received = DryFriction(machine.friction_mm).received_mm(command)
+    received = DryFriction(machine.friction_mm, 1.0 / RATE_HZ).received_mm(command)
     return RingMotion(
         Signal(0.0, 1.0 / RATE_HZ, received), tuple(stops), quiet, about, _plants(printed)
     )

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 from stillpath.compensation.friction import FrictionCompensator, against_friction
 from stillpath.compensation.registry import compensator
@@ -65,13 +66,31 @@ def test_nothing_is_added_in_rests_and_at_the_ends() -> None:
     assert np.abs(added).max(axis=1) == pytest.approx(MACHINE.friction_mm, rel=1e-3)
 
 
+def test_an_axis_that_stops_stays_where_it_stopped() -> None:
+    """The other axis moves on. The guide is another one: it rubs as much as it slips fast."""
+    t_s = np.arange(1500) * DT_S
+    path = np.stack([np.minimum(30.0 * t_s, 15.0), np.maximum(30.0 * t_s - 15.0, 0.0)])
+    command = against_friction(path, (0.008, 0.0), np.zeros((0, 2), np.int64), DT_S)[0]
+    w, held_mm, creep_mm_s = 2.0 * np.pi * 45.0, 0.008, 0.5
+
+    def motion(t: float, state: np.ndarray) -> list[float]:
+        place, speed = state
+        springs = np.interp(t, t_s, command) - place
+        return [speed, w**2 * (springs - held_mm * np.tanh(speed / creep_mm_s)) - 0.2 * w * speed]
+
+    times = t_s[600:1400]
+    found = solve_ivp(motion, (0.0, times[-1]), [0.0, 0.0], "LSODA", times, max_step=1e-3)
+    error = found.y[0] - path[0, 600:1400]
+    assert np.sqrt(np.mean(error**2)) < 0.15 * held_mm
+
+
 def test_what_is_added_is_smooth_and_arrives() -> None:
     path, _ = motion()
     none = np.zeros((0, 2), np.int64)
     command = against_friction(path, MACHINE.friction_mm, none, DT_S)
     bends = np.abs(np.diff(command - path, 2)).max() / DT_S**2
     assert bends < 5000.0
-    received = DryFriction(MACHINE.friction_mm).received_mm(command)
+    received = DryFriction(MACHINE.friction_mm, DT_S).received_mm(command)
     assert np.sqrt(np.mean((received - path)[:, 50:-50] ** 2)) < 0.1 * max(MACHINE.friction_mm)
 
 

@@ -6,17 +6,18 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from stillpath.models.friction import BEND_MM, DryFriction, bend_of
+from stillpath.models.friction import BEND_MM, CREEP_S, DryFriction, bend_of
 from stillpath.models.plants import PlantSetSpec
 from stillpath.models.store import load_machine
 
 HELD_MM = (0.003, 0.012)
-T_S = np.arange(3000) * 1e-3
+DT_S = 1e-3
+T_S = np.arange(3000) * DT_S
 WAYS = np.stack([2.0 * np.sin(9.0 * T_S), 5.0 + 0.05 * np.sin(40.0 * T_S) + 3.0 * T_S])
 
 
 def against(ways: np.ndarray) -> np.ndarray:
-    return ways + np.array(HELD_MM)[:, None] * np.stack([bend_of(row) for row in ways])
+    return ways + np.array(HELD_MM)[:, None] * np.stack([bend_of(row, DT_S) for row in ways])
 
 
 def test_the_bend_follows_the_way_and_turns_over() -> None:
@@ -32,19 +33,32 @@ def test_the_bend_follows_the_way_and_turns_over() -> None:
 
 
 def test_a_command_that_makes_up_for_it_arrives() -> None:
-    received = DryFriction(HELD_MM).received_mm(against(WAYS))
+    received = DryFriction(HELD_MM, DT_S).received_mm(against(WAYS))
     np.testing.assert_allclose(received, WAYS, atol=2e-6)
 
 
 def test_a_plain_command_is_held_back_by_as_much_as_it_says() -> None:
-    received = DryFriction(HELD_MM).received_mm(WAYS)
+    received = DryFriction(HELD_MM, DT_S).received_mm(WAYS)
     late = WAYS - received
-    np.testing.assert_allclose(np.abs(late).max(axis=1), HELD_MM, rtol=0.02)
+    np.testing.assert_allclose(np.abs(late).max(axis=1), HELD_MM, rtol=0.05)
+
+
+def test_an_axis_that_stands_creeps_to_its_command() -> None:
+    """Whether it stands after motion, or a command holds it ahead of where it was held back."""
+    way = np.stack([np.minimum(30.0 * T_S, 30.0), np.zeros(len(T_S))])
+    late = way - DryFriction(HELD_MM, DT_S).received_mm(way)
+    stopped = round(1.0 / DT_S)
+    assert late[0, stopped] == pytest.approx(HELD_MM[0], rel=0.01)
+    soon = stopped + round(0.5 * CREEP_S / DT_S)
+    assert 0.1 * HELD_MM[0] < late[0, soon] < HELD_MM[0]
+    assert abs(late[0, stopped + round(10 * CREEP_S / DT_S)]) < 0.01 * HELD_MM[0]
+    ahead = against(way) - way
+    assert abs(ahead[0, stopped + round(10 * CREEP_S / DT_S)]) < 1e-3 * HELD_MM[0]
 
 
 def test_blocks_make_no_difference() -> None:
-    whole = DryFriction(HELD_MM).received_mm(WAYS)
-    friction = DryFriction(HELD_MM)
+    whole = DryFriction(HELD_MM, DT_S).received_mm(WAYS)
+    friction = DryFriction(HELD_MM, DT_S)
     parts = [friction.received_mm(WAYS[:, a : a + 700]) for a in range(0, 3000, 700)]
     np.testing.assert_array_equal(np.hstack(parts), whole)
     friction.stand()
@@ -52,7 +66,7 @@ def test_blocks_make_no_difference() -> None:
 
 
 def test_without_friction_everything_arrives() -> None:
-    assert DryFriction((0.0, 0.0)).received_mm(WAYS) is WAYS
+    assert DryFriction((0.0, 0.0), DT_S).received_mm(WAYS) is WAYS
 
 
 def test_documents_without_friction_are_what_they_were() -> None:

@@ -65,7 +65,9 @@ def record(
         discretise(machine.axes[axis].nominal.scaled(factor, damping), 1 / _RATE_HZ)
         for axis, factor in zip(("x", "y"), frequency, strict=True)
     ]
-    nozzle = PlantStream(plants).push(DryFriction(machine.friction_mm).received_mm(position))
+    nozzle = PlantStream(plants).push(
+        DryFriction(machine.friction_mm, 1 / _RATE_HZ).received_mm(position)
+    )
     accel = np.zeros_like(nozzle)
     accel[:, 1:-1] = np.diff(nozzle, 2) * _RATE_HZ**2
     count = int(seconds * rate_hz)
