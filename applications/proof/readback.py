@@ -175,7 +175,8 @@ def _commanded(
             if not known and part.shaping is before:
                 known_from_s = float(part.samples.t_s[-1])
     rows += [r.executed_mm for r, _ in shaper.flush()]
-    received = DryFriction(machine.friction_mm, 1.0 / _RATE_HZ).received_mm(np.concatenate(rows, axis=1))
+    friction = DryFriction(machine.friction_mm, 1.0 / _RATE_HZ)
+    received = friction.received_mm(np.concatenate(rows, axis=1))
     return Signal(0.0, 1.0 / _RATE_HZ, received), known_from_s
 
 
