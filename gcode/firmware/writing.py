@@ -402,7 +402,8 @@ class StreamWriter:
         """Return lines that restore the file's state."""
         shaper, limits = self._shaper_before(verbatim), verbatim.limits_before
         begins = self._shaper_off and self._marked is None
-        if begins and (self._shaper_is_known or isinstance(verbatim, LeftOut)):
+        marks = self._shaper_is_known or self._stream_commands.marks or isinstance(verbatim, LeftOut)
+        if begins and marks:
             self._marked, limits = limits, self._stream_commands.in_stream(limits)
         if not self._streaming:
             marking = limits is not verbatim.limits_before
@@ -462,7 +463,9 @@ class StreamWriter:
         # A line that sets part of the shaper must find the other parts unchanged.
         foreign = bool(np.any(np.isin(verbatim.events.kind, _MAY_SET_SHAPER)))
         aside = isinstance(verbatim, LeftOut)  # between streams again and again
-        restores = self._shaper_is_known or self._marked is not None
+        restores = self._shaper_is_known or (
+            self._marked is not None and not self._stream_commands.marks
+        )
         if foreign or (prints and not aside and restores):
             return self._shaper_on(verbatim.limits_before)
         return self._advance_on(verbatim.limits_before) if prints and aside else b""
