@@ -408,15 +408,17 @@ def cancelling(lines: list[bytes], name: bytes, *, after: int) -> list[bytes]:
 
 
 @pytest.mark.parametrize("after", [0, 60])
+@pytest.mark.parametrize("lift", ["", "G1 Z6 E{6} F600\n"])
 def test_an_object_that_octoprint_skips_leaves_absolute_filament_right(
-    pipeline: Pipeline, machine: Machine, after: int
+    pipeline: Pipeline, machine: Machine, after: int, lift: str
 ) -> None:
     """From its beginning, or from the middle of a stream on, in a file that is a metre in."""
-    figure = "@Object {0}\nG1 X{1} Y{1} F6000\nG1 E{2} F2400\nG1 X{3} E{4} F3600\nG1 Y{3} E{5}\n"
+    figure = f"@Object {{0}}\n{lift}G1 X{{1}} Y{{1}} F6000\nG1 E{{2}} F2400\n"
+    figure += "G1 X{3} E{4} F3600\nG1 Y{3} E{5}\n"
     text = "@Object z\n" + HEAD.replace("M83", "M82\nG92 E1000")
-    text += figure.format("a", 80, 1001, 100, 1002, 1003)
-    text += figure.format("b", 120, 1004, 150, 1005, 1006) + "G28 X\n"
-    lines = pipeline(text).splitlines()
+    text += figure.format("a", 80, 1001, 100, 1002, 1003, 1000.5)
+    text += figure.format("b", 120, 1004, 150, 1005, 1006, 1003.5) + "G28 X\n"
+    lines = check(pipeline, text)
     sent = b"\n".join(cancelling(lines, b"a", after=after)) + b"\n"
     moves = [b.moves for b in Interpreter(machine).push(sent)]
     assert max(np.abs(m.end_mm - m.start_mm)[:, 3].max() for m in moves if len(m)) <= 1.001
