@@ -146,13 +146,13 @@ def test_a_change_of_filament_in_mid_stretch(file_position: int | None):
     assert limits(printer) == before
 
 
-def test_a_change_of_filament_that_broke_spoils_no_later_pause():
+@pytest.mark.parametrize("place", [{"virtual_sdcard": {"file_position": 100}}, {}])
+def test_a_change_of_filament_that_broke_spoils_no_later_pause(place: dict):
+    """Of a file on the printer's card, or sent line by line, as OctoPrint does."""
     fails = "[gcode_macro M600]\ngcode:\n  { action_raise_error('no filament') }\n"
-    place = {"virtual_sdcard": {"file_position": 100}}
     printer = in_stretch(fails, OURS, M600, extra=place)
     with pytest.raises(CommandError):
         printer.run("M600")
-    place["virtual_sdcard"]["file_position"] = 7  # another print
     printer.run("SET_VELOCITY_LIMIT ACCEL=1234")
     printer.run("PAUSE")
     printer.run("RESUME")
