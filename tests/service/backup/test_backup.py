@@ -137,8 +137,11 @@ def test_jobs_without_an_upload_come_back(store, data, tmp_path):
     assert tree(tmp_path / "new") == tree(data)
 
 
-def test_a_restore_starts_no_print(store, data, tmp_path):
-    waiting, done = (make_job(printer="left", print_after=True) for _ in range(2))
+@pytest.mark.parametrize("starts", [True, False])
+def test_a_restore_starts_no_print_and_replaces_no_file_of_a_printer(
+    store, data, tmp_path, starts
+):
+    waiting, done = (make_job(printer="left", print_after=starts) for _ in range(2))
     for job in (waiting, done):
         write(data / f"jobs/{job.id}/source/part.gcode", "G28\n")
         store.add(job)
