@@ -27,6 +27,7 @@ from pydantic import ValidationError
 
 from stillpath.models.document import Document
 from stillpath.pipeline.files import replacing, sync
+from stillpath.service.deliveries.rows import HELD_BACK
 from stillpath.service.instance_lock import RESTORING, exclusive, is_half_restored
 from stillpath.service.permissions import private_folder
 from stillpath.service.storage.leftovers import delete_leftovers
@@ -317,7 +318,7 @@ def _hold_back(database: Path) -> None:
     if not database.exists():
         return
     why = (
-        "held back: it was due when the backup was made that was restored since; download the "
+        f"{HELD_BACK}: it was due when the backup was made that was restored since; download the "
         "result, or submit the file again"
     )
     with contextlib.closing(sqlite3.connect(database)) as connection:
