@@ -27,7 +27,6 @@ from pydantic import ValidationError
 
 from stillpath.models.document import Document
 from stillpath.pipeline.files import replacing, sync
-from stillpath.service.deliveries.rows import HELD_BACK
 from stillpath.service.instance_lock import RESTORING, exclusive, is_half_restored
 from stillpath.service.permissions import private_folder
 from stillpath.service.storage.leftovers import delete_leftovers
@@ -318,8 +317,8 @@ def _hold_back(database: Path) -> None:
     if not database.exists():
         return
     why = (
-        f"{HELD_BACK}: it was due when the backup was made that was restored since; download the "
-        "result, or submit the file again"
+        "held back: it was due when the backup was made that was restored since, and the printer "
+        "may have a later file; download the result, or submit the file again"
     )
     with contextlib.closing(sqlite3.connect(database)) as connection:
         tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master")}
@@ -327,6 +326,12 @@ def _hold_back(database: Path) -> None:
             connection.execute(
                 "UPDATE deliveries SET state = 'failed', error = ? "
                 "WHERE state IN ('waiting', 'sending') AND kind = 'printer'",
+                (why,),
+            )
+            connection.execute(
+                "INSERT INTO deliveries (job_id, kind, target, state, attempts, next_at, error) "
+                "SELECT id, 'printer', printer, 'failed', 0, 0, ? FROM jobs "
+                "WHERE state IN ('queued', 'running') AND printer IS NOT NULL",
                 (why,),
             )
             connection.execute(

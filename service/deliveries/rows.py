@@ -25,7 +25,6 @@ from stillpath.service.database.tables import deliveries, jobs
 from stillpath.service.jobs.state import Job
 
 __all__ = [
-    "HELD_BACK",
     "Delivery",
     "bring_forward",
     "claim",
@@ -35,9 +34,6 @@ __all__ = [
     "prolong",
     "settle",
 ]
-
-HELD_BACK = "held back"
-"""Beginning of the error of what was due at a backup, and may have been sent since."""
 
 _AT_ONCE = 500
 
@@ -127,15 +123,13 @@ def overtaken(engine: Engine, claimed: Delivery, job: Job) -> str | None:
     Returns
     -------
     str or None
-        ``done``, ``sending``, ``failed`` (perhaps done: `HELD_BACK`), or None: there is no such
-        job, or it is not being sent.
+        ``done``, ``sending``, or None: there is no such job, or it is not being sent.
     """
     row = deliveries.c
     outran = jobs.c.finished_at <= job.finished_at
     later = (
         _rivals(claimed, job)
-        .where(or_(row.state.in_(("done", "sending")), row.error.startswith(HELD_BACK)))
-        .where(jobs.c.created_at > job.created_at)
+        .where(row.state.in_(("done", "sending")), jobs.c.created_at > job.created_at)
         .where(or_(row.id > claimed.id, outran))
         .order_by(row.state)
     )

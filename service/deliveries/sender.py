@@ -346,9 +346,8 @@ def _outdated(claimed: Delivery, job: Job, later: str) -> tuple[str, str]:
     """Return the outcome for a file that a `later` one overtook: done, or still being sent."""
     if later == "sending":
         return "waiting", f"a later {job.result_name} is on its way to {claimed.target}"
-    has = "has" if later == "done" else "may have"
     return "failed", (
-        f"{claimed.target} {has} a later {job.result_name} already, which this one would replace; "
+        f"{claimed.target} has a later {job.result_name} already, which this one would replace; "
         "submit the file again to send it all the same"
     )
 

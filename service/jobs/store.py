@@ -412,14 +412,18 @@ def _note_deliveries(connection: Connection, job: Job) -> None:
         due["printer"] = job.printer
     for kind, target in due.items():
         if target is not None:
+            # A restore has held it back where there is one already.
             connection.execute(
-                tables.deliveries.insert().values(
+                insert(connection, tables.deliveries)
+                .values(
                     job_id=job.id,
                     kind=kind,
                     target=target,
                     state="waiting",
+                    attempts=0,
                     next_at=job.finished_at,
                 )
+                .on_conflict_do_nothing()
             )
 
 
