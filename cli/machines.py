@@ -213,20 +213,22 @@ def put(
     file: Annotated[Path, typer.Argument(metavar="FILE")], by: By = None, message: Message = ""
 ) -> None:
     """Make the machine document in a file the new revision of its machine."""
+    from stillpath.applications.machines.diff import replaced_plants
     from stillpath.applications.machines.revision import source_file
     from stillpath.models.store import load_machine
 
     machine = load_machine(file)
     store = open_machines().store
-    print_revision(
-        store.add_revision(
-            machine.name,
-            machine,
-            author=who(by),
-            message=message or f"from {file.name}",
-            sources=[source_file(file.name, file.read_bytes())],
-        )
+    made = store.add_revision(
+        machine.name,
+        machine,
+        author=who(by),
+        message=message or f"from {file.name}",
+        sources=[source_file(file.name, file.read_bytes())],
     )
+    print_revision(made)
+    for line in replaced_plants(store.history(machine.name)[: made.number]):
+        typer.echo(line)
 
 
 @app.command("set-firmware")

@@ -10,7 +10,8 @@ from __future__ import annotations
 import errno
 import os
 import sys
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Annotated, NoReturn, TextIO
@@ -65,6 +66,15 @@ def main() -> NoReturn:
     sys.exit(run(sys.argv[1:]))
 
 
+@contextmanager
+def _named() -> Iterator[None]:
+    """Let an error say that it is the standard output that is full."""
+    try:
+        yield
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, "standard output") from error
+
+
 class _Out(TextIOWrapper):
     """Standard output: what is done counts, also if nobody reads the figures to their end."""
 
@@ -83,13 +93,13 @@ class _Out(TextIOWrapper):
 
     def write(self, text: str) -> int:
         """See `io.TextIOWrapper`."""
-        with suppress(self._unheard):
+        with suppress(self._unheard), _named():
             return super().write(text)
         return len(text)
 
     def flush(self) -> None:
         """See `io.TextIOWrapper`."""
-        with suppress(self._unheard):
+        with suppress(self._unheard), _named():
             super().flush()
 
 

@@ -6,7 +6,7 @@ the file is too large, exceeds a budget, or is refused by the last check.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,14 +15,14 @@ from stillpath.gcode.errors import GcodeError
 from stillpath.models.machine import Machine
 from stillpath.pipeline.file_rewriting import FileRewriting, file_rewriting
 from stillpath.pipeline.files import check_unchanged
-from stillpath.pipeline.job import Job
+from stillpath.pipeline.job import COMPENSATED, Job
 from stillpath.pipeline.last_check.errors import LastCheckError
 from stillpath.pipeline.live_printing import keep_file, predict_live, simulate_live
 from stillpath.pipeline.measuring.tracing import Trace
 from stillpath.pipeline.options import Options, unused
 from stillpath.pipeline.order import Order
 from stillpath.pipeline.pacing.budget import SpeedBudget
-from stillpath.pipeline.progress import ProgressCallback
+from stillpath.pipeline.progress import ProgressCallback, within
 from stillpath.pipeline.result import Result
 from stillpath.pipeline.selection import TooLarge, smaller
 
@@ -123,8 +123,10 @@ def _final_job(
     traced = None if again else trace
     budget: SpeedBudget | None = None
     layers = file.layers
+    times = _each_time(order.progress, several=again)
     while True:
-        job = Job(file.container.text, file.spool, order, layers, traced, budget)
+        asked = replace(order, progress=next(times))
+        job = Job(file.container.text, file.spool, asked, layers, traced, budget)
         try:
             result = job.run(name, file.container.facts())
             gentler = job.gentler
@@ -143,6 +145,30 @@ def _final_job(
         file.spool.seek(0)
         file.spool.truncate()
         layers = layers.anew() if layers is not None else None
+
+
+def _each_time(
+    progress: ProgressCallback | None, *, several: bool
+) -> Iterator[ProgressCallback | None]:
+    """Yield a callback for every time that a file is written; how often is not known before."""
+    begun = 0.0
+    if not several:
+        yield progress
+        begun = COMPENSATED
+    while True:
+        end = 0.5 * (begun + 1.0)
+        yield _but_done(progress, within(progress, begun, end))
+        begun = end
+
+
+def _but_done(
+    progress: ProgressCallback | None, part: ProgressCallback | None
+) -> ProgressCallback | None:
+    """Return a callback for a part of the work that may be the last one, and say so then."""
+    if progress is None or part is None:
+        return None
+    whole, of_part = progress, part
+    return lambda now: whole(now) if now.stage == "done" else of_part(now)
 
 
 def _fitting(options: Options, name: str) -> Options:

@@ -74,14 +74,15 @@ from stillpath.pipeline.verifying import Verifier
 if TYPE_CHECKING:
     from _typeshed import SupportsWrite
 
-__all__ = ["Attempt", "Job"]
+__all__ = ["COMPENSATED", "Attempt", "Job"]
 
 _SAID = (Unfit, GcodeError, DesignError, ModelError)
 """Errors whose message tells the user why a piece cannot be compensated."""
 _FAULTS = (*_SAID, ArithmeticError, AssertionError, LookupError, TypeError, ValueError)
 """These and our own bugs: only the piece concerned stays as sliced."""
 _PLANNED = (Piece, LeftOut)
-_CHOSEN, _COMPENSATED = 0.2, 0.99
+_CHOSEN = 0.2
+COMPENSATED = 0.99
 """Shares of the work done when the speeds are chosen, and when the last piece is compensated."""
 
 
@@ -232,7 +233,7 @@ class Job:
             self._operation.passed(item.moves)
             # Not source.tell(): a whole block is read before its first piece is compensated.
             share = (item.text_offset + len(item.text)) / size
-            self._say("compensating", begun + (_COMPENSATED - begun) * share)
+            self._say("compensating", begun + (COMPENSATED - begun) * share)
         if self._sum.moves == 0:
             raise GcodeError("the file contains no moves; is it G-code with LF line ends?")
         if self._changes:

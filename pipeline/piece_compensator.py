@@ -79,6 +79,8 @@ class CompensatedPiece:
     extruding : ndarray of bool, shape (n,)
     step_mm, bend_mm : float
         Longest step of the command in XY, and largest second difference of either axis.
+    keeps_ripple : bool
+        Its ripple is not compensated, although that was asked for.
     """
 
     timeline: Timeline
@@ -88,6 +90,7 @@ class CompensatedPiece:
     encoded: Encoded
     step_mm: float
     bend_mm: float
+    keeps_ripple: bool
 
 
 class PieceCompensator:
@@ -222,7 +225,11 @@ class PieceCompensator:
         at = np.rint(encoded.start_s / DT_S).astype(np.int64)
         row = timeline.row[np.minimum(at, len(timeline.row) - 1)]
         self._check_travel(encoded.position[:, :2].T / 1e6, row, piece)
-        made = CompensatedPiece(timeline, command, extruding, segments, encoded, step_mm, bend_mm)
+        ripples = getattr(self.compensator, "budget_mm_s2", None) == 0.0
+        peak_mm = (step_mm, bend_mm)
+        made = CompensatedPiece(
+            timeline, command, extruding, segments, encoded, *peak_mm, keeps_ripple=ripples
+        )
         gap_mm = deviation(made, encoded.phases)
         reason = strayed(gap_mm, extruding, self._follow_mm, briefly=briefly)
         if reason is not None:

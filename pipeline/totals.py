@@ -30,7 +30,7 @@ class Totals:
         self.peak_rate = self.peak_velocity = self.peak_accel = 0.0
         self.gap2 = self.gap_max = self.filament_error = 0.0
         self.passed_s, self.passed_motion_s, self.passed_line = 0.0, 0.0, 0
-        self.left_out_s = self.left_out_extruding_s = 0.0
+        self.left_out_s = self.left_out_extruding_s = self.rippling_s = 0.0
         self.gap_count = 0
         self.put_back: list[PutBack] = []
         self.warnings: list[str] = []
@@ -43,7 +43,9 @@ class Totals:
         seconds = executed.duration_s + float(timeline.start_s[0])
         self.time_s += seconds
         self.compensated_s += seconds
-        self.extruding_s += DT_S * np.count_nonzero(made.extruding)
+        extruding_s = DT_S * np.count_nonzero(made.extruding)
+        self.extruding_s += extruding_s
+        self.rippling_s += extruding_s if made.keeps_ripple else 0.0
         self.segments += len(segments)
         if len(segments):
             rate = np.bincount((segments.end_s - 1e-9).astype(np.int64))
@@ -144,7 +146,13 @@ class Totals:
             )
 
     def left_alone(self) -> Iterator[str]:
-        """Yield a warning where much was not compensated."""
+        """Yield warnings where ripple, or much, was not compensated."""
+        if self.rippling_s > 0.0:
+            yield (
+                f"the ripple of {self.rippling_s:.0f} s of extruding is not compensated: the "
+                "commands of these pieces are at the limits of the motors (command) without it. "
+                "Slice with lower accelerations, or state what the motors bear"
+            )
         passed_s = self.left_alone_extruding_s
         if self.put_back_share > _WARN_SHARE:
             longest = max(self.put_back, key=lambda piece: piece.extruding_seconds)

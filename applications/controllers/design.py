@@ -242,19 +242,20 @@ def _check_fit(spec: LoopSpec, nominal: Loop, method: str) -> None:
 
 def _check_size(spec: LoopSpec, loops: tuple[Loop, ...], options: ControllerOptions) -> None:
     """Refuse, before computing anything, designs that would take minutes to check."""
-    states = _OTHER_STATES
+    states, other = _OTHER_STATES, "name fewer frequencies"
     if isinstance(options, WideOptions):
         states += round(1.0 / (loops[0].dt_s * options.fundamental_hz))
+        other = "take a multiple of the fundamental"
     elif isinstance(options, QuasiOptions | MultirateOptions):
         states += shared_period(1 / loops[0].dt_s, options.fundamental_hz).denominator
+        other = "round the frequency to a simpler fraction of the sampling rate, use rc-wide"
     elif isinstance(options, MmpOptions):
         states += 2 * len(options.targets_hz) * _every(spec)
     largest = int((_LARGEST_WORK / len(loops)) ** (1 / 3))
     if states > largest:
         raise DesignError(
             f"{options.method} would remember some {states} samples; with {len(loops)} plants "
-            f"stability is judged up to {largest} here. Round the frequency to a simpler fraction "
-            "of the sampling rate, use rc-wide, or name fewer members"
+            f"stability is judged up to {largest} here: {other}, or name fewer members"
         )
 
 

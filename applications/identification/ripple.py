@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from pydantic import ValidationError
 
-from stillpath.applications.identification.run import LARGEST_BYTES, read_inputs
+from stillpath.applications.identification.run import LARGEST_BYTES, InputFile, read_inputs
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.readers.compressed import unpacked
 from stillpath.models.identification.readers.tables import check_size
@@ -30,6 +30,7 @@ class LearntRipple:
     """A machine with ripple, and the sources of the learning."""
 
     machine: Machine
+    axis: RippleAxis
     sources: tuple[SourceFile, ...]
     summary: str
 
@@ -42,13 +43,18 @@ class LearntRipple:
             If no machine can have them.
         """
         machine = self.machine
+        update = {"title": title or machine.title}
         if name is not None and name != machine.name:
-            title = title or f"{machine.title}, ripple learnt"
-        update = {"name": name or machine.name, "title": title or machine.title}
+            update = {
+                "name": name,
+                "title": title or f"{machine.title}, ripple learnt",
+                "source": f"all but the ripple of axis {self.axis.upper()} is of {machine.title} "
+                f"({machine.name}): {machine.source}",
+            }
         try:
             return Machine.model_validate(machine.model_dump() | update)
         except ValidationError as error:
-            raise ModelError(f"machine {update['name']!r:.80}: {explain(error)}") from None
+            raise ModelError(f"machine {name or machine.name!r:.80}: {explain(error)}") from None
 
 
 def learn_from_files(
@@ -81,6 +87,13 @@ def learn_from_files(
         )
     basis = [parse_basis(text) for text in parts]
     inputs = read_inputs(files)
+    known: dict[bytes, InputFile] = {}
+    for file in inputs:
+        if (first := known.setdefault(file.content, file)) is not file:
+            raise ModelError(
+                f"{file.name} is a copy of {first.name}, and a copy is no repeat: give each pass "
+                "once"
+            )
     passes = [read_pass(_text(f.content, f.name), f.name) for f in inputs]
     made, learning = learn_machine_ripple(
         machine,
@@ -91,7 +104,7 @@ def learn_from_files(
         remaining=remaining,
         homing_repeatability_mm=homing_repeatability_mm,
     )
-    return LearntRipple(made, tuple(f.source for f in inputs), _summary(axis, made, learning))
+    return LearntRipple(made, axis, tuple(f.source for f in inputs), _summary(axis, made, learning))
 
 
 def parse_basis(text: str) -> WaveBasis:

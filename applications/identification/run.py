@@ -144,8 +144,9 @@ def _check_sampled(axis: Axis, plant: PlantSpec) -> None:
 
 def _read_input(argument: str) -> InputFile:
     path, condition = Path(argument), Condition()
-    if not path.exists() and "@" in argument:
-        before, _, after = argument.rpartition("@")
+    before, _, after = argument.rpartition("@")
+    # An @ may be the file's own, or its folder's.
+    if not path.exists() and Path(before).exists() and not Path(before).is_dir():
         path, condition = Path(before), Condition.parse(after)
     content = read_bytes(path, LARGEST_BYTES, "no measurement is that large")
     return InputFile(path.name, content, condition)
@@ -204,7 +205,10 @@ def _with_plants(
         if one.schedule is not None:
             document["schedules"][axis] = one.schedule.model_dump()
     if name is not None and name != base.name:
-        kept = ", ".join(f"axis {axis.upper()}" for axis in sorted(base.axes.keys() - found.keys()))
+        kept = ", ".join(
+            [f"axis {axis.upper()}" for axis in sorted(base.axes.keys() - found.keys())]
+            + [f"ripple of {axis.upper()}" for axis in sorted(base.ripple)]
+        )
         document.update(
             name=name,
             title=title or f"{base.title}, measured",

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from stillpath.applications.machines.resonances import Resonance, matched, resonances
+from stillpath.applications.machines.revision import Revision
 from stillpath.models.machine import Machine
 from stillpath.models.plants import PlantSetSpec, PlantSpec
 
-__all__ = ["Change", "diff"]
+__all__ = ["Change", "diff", "replaced_plants"]
 
 _SHOWN = 60
 
@@ -42,6 +43,26 @@ def diff(old: Machine, new: Machine) -> tuple[Change, ...]:
             del document["nominal"]
         changes += _values(place, axes_before[axis], axes_after[axis])
     return tuple(changes)
+
+
+def replaced_plants(history: Sequence[Revision]) -> Iterator[str]:
+    """Yield a line if the newest revision brings plants of an earlier one back.
+
+    As a file does that was exported before the machine was measured again.
+    """
+    if len(history) < 2:
+        return
+    *earlier, before, now = history
+    for axis, plants in sorted(now.machine.axes.items()):
+        if plants == before.machine.axes[axis]:
+            continue
+        again = [r.number for r in earlier if r.machine.axes[axis] == plants]
+        if again:
+            yield (
+                f"axis {axis.upper()}: the plants are those of revision {again[-1]} again; "
+                f"revision {before.number} had newer ones. If the file is an old export: "
+                f"`stillpath machines rollback {now.machine.name} {before.number}`"
+            )
 
 
 def _plants(place: str, axis: str, old: PlantSetSpec, new: PlantSetSpec) -> Iterator[Change]:

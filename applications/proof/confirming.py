@@ -33,7 +33,6 @@ from stillpath.applications.proof.ring_motion import (
     RATE_HZ,
     RingMotion,
     accelerations,
-    predicted,
     read_ring_motion,
 )
 from stillpath.applications.proof.ring_test import AXES, Axis
@@ -91,9 +90,7 @@ def verify_ring(
         The file or a log cannot be read.
     """
     motion = read_ring_motion(printed, machine)
-    nominal = np.stack(
-        [predicted(motion.command.rows[k], machine.axes[a].nominal) for k, a in enumerate(AXES)]
-    )
+    nominal = np.stack([motion.predicted(axis, machine.axes[axis].nominal) for axis in AXES])
     notes: list[str] = []
     if machine.schedules:
         notes.append("The model follows mass or position; predicted is what the nominal plants do.")
@@ -177,7 +174,7 @@ class _Axis:
         self._band = _band(self._plants)
         self._command = motion.command.rows[AXES.index(axis)]
         self._members = [
-            predicted(self._command, member.plant) for member in self._plants.weighted_members()
+            motion.predicted(axis, member.plant) for member in self._plants.weighted_members()
         ]
         self._reasons: list[str] = []
         self._sources: list[SourceFile] = []
@@ -353,7 +350,7 @@ class _Axis:
             self._axis,
             self._plants.nominal,
             accelerations(self._command[None])[0, part],
-            predicted(self._command, self._plants.nominal)[part],
+            self._motion.predicted(self._axis, self._plants.nominal)[part],
             log.measured[part],
         )
         try:

@@ -19,8 +19,8 @@ from stillpath.applications.proof.program import (
     Program,
     place,
 )
+from stillpath.gcode.firmware.file_shapers import FILE_SETS_SHAPER
 from stillpath.gcode.firmware.registry import adapter
-from stillpath.gcode.firmware.writing import FILE_SETS_SHAPER
 from stillpath.models.machine import Machine
 from stillpath.models.plants import continuous
 from stillpath.pipeline.compensate import compensate_file

@@ -25,12 +25,13 @@ from stillpath.models.errors import ModelError
 from stillpath.models.friction import DryFriction
 from stillpath.models.machine import Machine
 from stillpath.models.plants import PlantSpec, discretise
+from stillpath.models.ripple import MachineRipple
 from stillpath.models.runs import runs
 from stillpath.pipeline.file_motion import TextMotion
 from stillpath.pipeline.reading import dialect_for
 from stillpath.simulation.response import PlantStream
 
-__all__ = ["RingMotion", "Stop", "is_ring_test", "predicted", "read_ring_motion"]
+__all__ = ["RingMotion", "Stop", "is_ring_test", "read_ring_motion"]
 
 RATE_HZ = 1000.0
 _HEAD_BYTES = 4096
@@ -60,7 +61,9 @@ class RingMotion:
     Attributes
     ----------
     command : Signal
-        Positions of X and Y in mm, as dry friction lets the axes have them.
+        Positions of X and Y in mm, as ripple and dry friction let the axes have them.
+    added_mm : ndarray, shape (2, n)
+        Deviation of the tool on top of that, by ripple on the output side.
     quiet_s : dict
         By axis from when until when it stands still long before it moves (the other one creeps, as
         after the stops).
@@ -71,6 +74,7 @@ class RingMotion:
     """
 
     command: Signal
+    added_mm: Array
     stops: tuple[Stop, ...]
     quiet_s: dict[Axis, list[tuple[float, float]]]
     about: dict[Axis, NDArray[np.bool_]]
@@ -79,6 +83,13 @@ class RingMotion:
     def of(self, axis: Axis, *, compensated: bool) -> list[Stop]:
         """Return the stops of a half of an axis."""
         return [s for s in self.stops if s.axis == axis and s.compensated is compensated]
+
+    def predicted(self, axis: Axis, spec: PlantSpec) -> Array:
+        """Return the acceleration [mm/s^2] of an axis, shape (n,), by one of its plants."""
+        k = AXES.index(axis)
+        plant = discretise(spec, 1.0 / RATE_HZ)
+        moved = PlantStream([plant]).push(self.command.rows[k : k + 1])
+        return np.asarray(accelerations(moved + self.added_mm[k])[0])
 
 
 def is_ring_test(printed: Path) -> bool:
@@ -124,16 +135,17 @@ def read_ring_motion(printed: Path, machine: Machine) -> RingMotion:
         quiet[axis] = [(first / RATE_HZ, end / RATE_HZ) for first, end in runs(own["quiet"])]
         about[axis] = np.any(list(own.values()), axis=0)
     stops.sort(key=lambda stop: stop.at_s)
-    received = DryFriction(machine.friction_mm, 1.0 / RATE_HZ).received_mm(command)
+    ripple = MachineRipple(machine.kinematics, machine.ripple)
+    friction = DryFriction(machine.friction_mm, 1.0 / RATE_HZ)
+    received = friction.received_mm(ripple.received_mm(command))
     return RingMotion(
-        Signal(0.0, 1.0 / RATE_HZ, received), tuple(stops), quiet, about, _plants(printed)
+        Signal(0.0, 1.0 / RATE_HZ, received),
+        ripple.added_mm(command),
+        tuple(stops),
+        quiet,
+        about,
+        _plants(printed),
     )
-
-
-def predicted(command: Array, spec: PlantSpec) -> Array:
-    """Return the acceleration [mm/s^2] of one axis, shape (n,), by one of its plants."""
-    plant = discretise(spec, 1.0 / RATE_HZ)
-    return np.asarray(accelerations(PlantStream([plant]).push(command[None]))[0])
 
 
 def accelerations(position: Array) -> Array:

@@ -36,7 +36,7 @@ _FOREIGN = {
     b"Rar!": "a RAR archive",
     b"\x7fELF": "a program",
 }
-_JSON = re.compile(rb'(\xef\xbb\xbf)?\s*\{\s*"')
+_JSON = re.compile(rb'(\xef\xbb\xbf)?\s*(\{\s*"|\[\s*["\d\[{-])')
 _STL_HEAD_BYTES = 84
 """Header of a binary STL model: 80 arbitrary bytes and the number of facets in four."""
 _STL_FACET_BYTES = 50

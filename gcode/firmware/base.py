@@ -125,6 +125,10 @@ class StreamCommands(Protocol):
         """G1.5 is a G1 (Marlin)."""
 
     @property
+    def marks(self) -> bool:
+        """`in_stream` does no more than mark limits, for macros that find the shaper off."""
+
+    @property
     def factors_need_axes(self) -> bool:
         """M220 and M221 do not apply to moves of the extruder alone (RepRapFirmware)."""
 

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 
 from stillpath.gcode.firmware.line_reader import NUMBERED
 
-__all__ = ["FileShapers"]
+__all__ = ["FILE_SETS_SHAPER", "FileShapers"]
+
+FILE_SETS_SHAPER = "The file sets the firmware's input shaper"
+"""Beginning of the warning."""
 
 _VALUE = re.compile(rb"(?<=[SF=])\s*[-+.\d]+")
 _ADVANCE, _FURTHER_SHAPER = "M572", re.compile(rb"M593(?!\d)", re.IGNORECASE)
@@ -41,10 +45,14 @@ class FileShapers:
         others = {k: text for k, text in self.lines.items() if k != form}
         self.lines = {**others, form: line.rstrip() + b"\n"}
 
-    @property
-    def said(self) -> str:
-        """Return which commands of the file set a shaper, and where; often empty."""
-        return ", ".join(
+    def warnings(self) -> Iterator[str]:
+        """Yield which commands of the file set a shaper, and where; often nothing."""
+        said = ", ".join(
             f"{name} (line {line}{f' and {count - 1} more' if count > 1 else ''})"
             for name, (line, count) in self._names.items()
         )
+        if said:
+            yield (
+                f"{FILE_SETS_SHAPER}: {said}. Compensation and shaper do "
+                "not add up: in compensated stretches it is off, around them as the file sets it."
+            )

@@ -1,33 +1,107 @@
-"""Keep the mark of a stream in lines of the file that stand where the shaper is off."""
+"""Lines of ours among the file's: the mark of a stream, and the state behind skipped objects."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+
 import numpy as np
+from numpy.typing import NDArray
 
 from stillpath.gcode.firmware.base import StreamCommands
+from stillpath.gcode.firmware.line_reader import SET_POSITION
+from stillpath.gcode.firmware.modes import feed_line
 from stillpath.gcode.pieces import VerbatimPart
 from stillpath.gcode.types import EventKind, Limits
 
-__all__ = ["marked_text"]
+__all__ = ["ends_at_mark", "file_text"]
+
+Inserted = Iterator[tuple[int, bytes]]
+"""Places in the bytes of a part, and the lines that come there."""
 
 
-def marked_text(verbatim: VerbatimPart, commands: StreamCommands, marked: Limits | None) -> bytes:
-    """Return the text of a part, with the mark set again behind lines that remove it.
+def file_text(
+    verbatim: VerbatimPart,
+    commands: StreamCommands,
+    extruder_mm: float | None,
+    *,
+    marked: bool,
+    behind_mark: bool,
+) -> bytes:
+    """Return the text of a part, with lines of ours in it where they are needed.
 
     Parameters
     ----------
-    marked : Limits, optional
-        Limits with the mark; None: it is not in force.
+    extruder_mm : float, optional
+        The file's E where the part begins; None: there was no stream yet.
+    marked : bool
+        Limits are in force with the mark of a stream.
+    behind_mark : bool
+        The part begins behind an object's mark, and no move in between.
     """
-    if marked is None:
-        return verbatim.text
-    events, parts, done = verbatim.events, [], 0
+    inserted = list(_mark_lines(verbatim, commands)) if marked else []
+    if extruder_mm is not None:
+        in_force = commands.in_stream if marked else _as_it_is
+        inserted += _behind_skipped(verbatim, commands, extruder_mm, in_force, behind_mark)
+    parts, done = [], 0
+    for place, lines in sorted(inserted):
+        parts += [verbatim.text[done:place], lines]
+        done = place
+    return b"".join([*parts, verbatim.text[done:]])
+
+
+def ends_at_mark(verbatim: VerbatimPart) -> bool:
+    """Return whether no move stands behind the last mark by which a host skips objects."""
+    return bool(np.any(_host_marks(verbatim) == len(verbatim.moves)))
+
+
+def _mark_lines(verbatim: VerbatimPart, commands: StreamCommands) -> Inserted:
+    """Yield the limits with the mark of a stream, behind the file's lines that remove it."""
+    events = verbatim.events
     for row in np.flatnonzero(events.kind == EventKind.LIMITS).tolist():
         line = verbatim.line(events, row)
-        if not (line.endswith(b"\n") and commands.unmarks(line)):
+        if line.endswith(b"\n") and commands.unmarks(line):
+            own = verbatim.limits[int(events.limits_id[row])]
+            end = int(events.byte_end[row]) - verbatim.text_offset
+            yield end, commands.limits(commands.in_stream(own))
+
+
+def _behind_skipped(
+    verbatim: VerbatimPart,
+    commands: StreamCommands,
+    extruder_mm: float,
+    in_force: Callable[[Limits], Limits],
+    behind_mark: bool,
+) -> Inserted:
+    """Yield what a file with absolute E relies on, before its moves behind objects' marks.
+
+    OctoPrint's Cancel Objects sends no line of an object, the end of a stream included, and then a
+    G92 E by the absolute E that it has read; but a stream has relative E.
+    """
+    moves, events = verbatim.moves, verbatim.events
+    marks = np.append(_host_marks(verbatim), np.zeros(int(behind_mark), np.int64))
+    if not len(marks):
+        return
+    sets = [row for row in range(len(events)) if SET_POSITION.match(verbatim.line(events, row))]
+    known = int(events.move_index[sets[0]]) if sets else len(moves) - 1
+    for row in np.unique(marks[(marks <= known) & (marks < len(moves))]).tolist():
+        state = verbatim.modal[int(moves.modal_id[row])]
+        if not state.absolute_e:
             continue
-        end = int(events.byte_end[row]) - verbatim.text_offset
-        own = verbatim.limits[int(events.limits_id[row])]
-        parts += [verbatim.text[done:end], commands.limits(commands.in_stream(own))]
-        done = end
-    return b"".join([*parts, verbatim.text[done:]])
+        fed_mm = float(moves.start_mm[row, 3] - moves.start_mm[0, 3])
+        lines = commands.limits(in_force(verbatim.limits[int(moves.limits_id[row])]))
+        lines += b"G90\nM82\n" if state.absolute_xyz else b"G91\nM82\n"
+        lines += b"G92 E%.7f\n" % (extruder_mm + fed_mm / state.extrude_factor)
+        lines += feed_line(float(moves.speed_mm_s[row]) * 60.0 / state.speed_factor)
+        yield int(moves.byte_start[row]) - verbatim.text_offset, lines
+
+
+def _host_marks(verbatim: VerbatimPart) -> NDArray[np.int64]:
+    """Return which moves marks stand before; the firmware's own leave state and E as they are."""
+    events = verbatim.events
+    rows = np.flatnonzero(events.kind == EventKind.OBJECT).tolist()
+    hosts = [row for row in rows if verbatim.line(events, row).lstrip().startswith((b"@", b";"))]
+    return events.move_index[hosts]
+
+
+def _as_it_is(limits: Limits) -> Limits:
+    return limits

@@ -29,16 +29,13 @@ from stillpath.gcode.firmware.line_reader import (
     STANDS,
     LineReader,
 )
-from stillpath.gcode.firmware.marking import marked_text
+from stillpath.gcode.firmware.marking import ends_at_mark, file_text
 from stillpath.gcode.firmware.modes import WrittenModes, feed_line, written_modes
 from stillpath.gcode.firmware.planning import stops
 from stillpath.gcode.pieces import LeftOut, Piece, VerbatimPart
 from stillpath.gcode.types import EventKind, Limits, ModalState
 
-__all__ = ["FILE_SETS_SHAPER", "StreamWriter"]
-
-FILE_SETS_SHAPER = "The file sets the firmware's input shaper"
-"""Beginning of the warning."""
+__all__ = ["StreamWriter"]
 
 _BYTES_PER_LINE = 96
 _LEVEL, _EVENT, _REST = range(3)
@@ -82,6 +79,8 @@ class StreamWriter:
         self._file_feed_mm_min = 0.0
         self._behind: tuple[Limits, ModalState] | None = None
         """What the file had set after the last piece."""
+        self._behind_mark = False
+        """No move came since an object's mark."""
         self._left_off: set[str] = set()
         """Axes whose shaper is not stated, so that it stays off behind a stream."""
 
@@ -93,11 +92,7 @@ class StreamWriter:
                 f"The firmware's own input shaper{whose} is not known (firmware.shaper in the "
                 "machine): it is switched off and stays off; set it again after the print."
             )
-        if said := self._file_shapers.said:
-            yield (
-                f"{FILE_SETS_SHAPER}: {said}. Compensation and shaper do "
-                "not add up: in compensated stretches it is off, around them as the file sets it."
-            )
+        yield from self._file_shapers.warnings()
 
     def leading(self, piece: Piece, extruder_mm: float) -> bytes:
         """Return lines that take time before a piece's stream, often none; as in `piece`.
@@ -145,6 +140,7 @@ class StreamWriter:
             For a line that must not stand in a file with a stream.
         """
         moves, events = verbatim.moves, verbatim.events
+        file_mm = extruder_mm + self._zero_mm if self._behind is not None else None
         lead = self._off(verbatim, extruder_mm)
         if self._marked is not None:
             self._marked = verbatim.limits_after
@@ -159,7 +155,9 @@ class StreamWriter:
             self._file_shapers.note(line, int(events.line[row]))
         if len(moves) or np.any(stops(events)):
             self._at_rest = self._rests(verbatim, at_end=True)
-        return lead + marked_text(verbatim, self._stream_commands, self._marked)
+        where = {"marked": self._marked is not None, "behind_mark": self._behind_mark}
+        self._behind_mark = ends_at_mark(verbatim) or (self._behind_mark and not len(moves))
+        return lead + file_text(verbatim, self._stream_commands, file_mm, **where)
 
     def piece(self, piece: Piece, encoded: Encoded, extruder_mm: float) -> bytes:
         """Return the text of a compensated piece; `extruder_mm` as in `verbatim`."""
@@ -201,7 +199,7 @@ class StreamWriter:
             ]
         last = piece.moves.speed_mm_s[-1]
         self._file_feed_mm_min = float(last) * 60.0 / piece.modal_after.speed_factor
-        self._at_rest = False
+        self._at_rest = self._behind_mark = False
         self._behind = (piece.limits_after, piece.modal_after)
         return b"".join(parts)
 
@@ -402,7 +400,8 @@ class StreamWriter:
         """Return lines that restore the file's state."""
         shaper, limits = self._shaper_before(verbatim), verbatim.limits_before
         begins = self._shaper_off and self._marked is None
-        if begins and (self._shaper_is_known or isinstance(verbatim, LeftOut)):
+        stays = self._stream_commands.marks or isinstance(verbatim, LeftOut)
+        if begins and (stays or self._shaper_is_known):
             self._marked, limits = limits, self._stream_commands.in_stream(limits)
         if not self._streaming:
             marking = limits is not verbatim.limits_before
@@ -462,7 +461,9 @@ class StreamWriter:
         # A line that sets part of the shaper must find the other parts unchanged.
         foreign = bool(np.any(np.isin(verbatim.events.kind, _MAY_SET_SHAPER)))
         aside = isinstance(verbatim, LeftOut)  # between streams again and again
-        restores = self._shaper_is_known or self._marked is not None
+        restores = self._shaper_is_known or (
+            self._marked is not None and not self._stream_commands.marks
+        )
         if foreign or (prints and not aside and restores):
             return self._shaper_on(verbatim.limits_before)
         return self._advance_on(verbatim.limits_before) if prints and aside else b""

@@ -33,7 +33,7 @@ from stillpath.models.response_kernels import dense_response
 from stillpath.models.ripple import AxisRipple, RippleHarmonic, RippleSide, RippleSource
 from stillpath.models.runs import runs
 
-__all__ = ["PassLog", "RippleLearning", "WaveBasis", "learn_ripple", "update_ripple"]
+__all__ = ["PassLog", "RippleLearning", "WaveBasis", "check_gain", "learn_ripple", "update_ripple"]
 
 _STEADY = 1e-3
 """Relative change of speed that still counts as steady."""
@@ -163,6 +163,17 @@ def _solved(matrix: Array, aim: Array, waves: int) -> tuple[Complex, Array, floa
     return sines + 1j * cosines, sd_mm, residual
 
 
+def check_gain(gain: float) -> None:
+    """Refuse a gain with which passes would not converge, or teach nothing.
+
+    Raises
+    ------
+    ModelError
+    """
+    if not 0.0 < gain <= 1.0:
+        raise ModelError(f"learning gain {gain:g} must lie above 0 and not above 1")
+
+
 def update_ripple(
     known: AxisRipple, learnt: AxisRipple, *, gain: float = 0.5, remaining: bool = False
 ) -> AxisRipple:
@@ -185,8 +196,7 @@ def update_ripple(
         If `gain` is outside 0 to 1, a source of the same name has another pitch or side, or the
         sum cannot be the ripple of an axis.
     """
-    if not 0.0 < gain <= 1.0:
-        raise ModelError(f"learning gain {gain} must lie above 0 and not above 1")
+    check_gain(gain)
     old, new = _by_wave(known), _by_wave(learnt)
     parts, learnt_parts = (dict.fromkeys(wave[:3] for wave in waves) for waves in (old, new))
     for name, pitch_mm, enters in learnt_parts:

@@ -26,6 +26,7 @@ from stillpath.models.identification.ripple import (
     PassLog,
     RippleLearning,
     WaveBasis,
+    check_gain,
     learn_ripple,
     update_ripple,
 )
@@ -115,6 +116,7 @@ def learn_machine_ripple(
     ModelError
         See `learn_ripple`; or if the ripple cannot enter at `axis`.
     """
+    check_gain(gain)
     _check_axis(machine, axis, basis)
     plant = _plant(machine, axis)
     learning = learn_ripple(passes, basis, plant, homing_repeatability_mm=homing_repeatability_mm)

@@ -2,7 +2,8 @@
 
 Shaper and plant are both linear, so they commute: each plant's response to the plan is computed
 once, and the response to a shaped plan is a few shifted copies of it, needed only at the points
-that are measured.
+that are measured. Dry friction and ripple do not commute. With them that is for the search of
+frequencies only, and errors are those of the shaped plan.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from stillpath.models.shaping import AxisShaper, Shaping
 from stillpath.pipeline.advising.advice import Advice, Bound, wanted_accel
 from stillpath.pipeline.measuring.reference_shaper import shaped_at, spread
 from stillpath.pipeline.pacing.samples import FileSamples, Sample
+from stillpath.pipeline.shaping import shaped
 from stillpath.simulation.measures import PathDistances
 from stillpath.simulation.scheduled import MachineStream
 
@@ -85,7 +87,9 @@ class Trial:
         self.seconds = motion.seconds
         self.total_s = sum(motion.seconds.values())
         self._distance = PathDistances(self._path, dt_s)
-        self._answers = [self._answer(machine, member) for member in members]
+        self._machine, self._members = machine, members
+        self._commutes = not (machine.ripple or any(machine.friction_mm))
+        self._answers = [self._answer(member, self._path) for member in members]
         self._index = {
             f: spread(np.flatnonzero(motion.feature == f).astype(np.int64), _POINTS)
             for f in np.unique(motion.feature).tolist()
@@ -119,6 +123,11 @@ class Trial:
     def _distances(self, shapings: Mapping[OperatingPoint, Shaping] | Shaping, at: Ints) -> Array:
         """Return contour errors [mm] at chosen samples, shape (members, len(at))."""
         out = np.empty((len(self._answers), len(at)))
+        if not self._commutes:
+            command = self._command(shapings)
+            for row, member in zip(out, self._members, strict=True):
+                row[:] = self._distance.at(self._answer(member, command)[:, at], at)
+            return out
         for row, answer in zip(out, self._answers, strict=True):
             y = np.empty((2, len(at)))
             if isinstance(shapings, Shaping):
@@ -156,15 +165,22 @@ class Trial:
             worst = max(worst, float(error @ error))
         return float(np.sqrt(worst / max(len(at), 1)))
 
-    def _answer(self, machine: Machine, member: int | None) -> Array:
+    def _command(self, shapings: Mapping[OperatingPoint, Shaping] | Shaping) -> Array:
+        """Return the shaped plan; every sample of it begins and ends at rest."""
+        parts = [np.zeros((2, 0))]
+        for first, last, point in self._bounds:
+            shaping = shapings if isinstance(shapings, Shaping) else shapings[point]
+            parts.append(shaped(self._path[:, first:last], shaping, self._dt_s))
+        return np.concatenate(parts, axis=1)
+
+    def _answer(self, member: int | None, command_mm: Array) -> Array:
         parts = [np.zeros((2, 0))]
         stream: MachineStream | None = None
         for first, last, point in self._bounds:
             if stream is None:
-                stream = MachineStream(machine, self._dt_s, point, member=member)
+                stream = MachineStream(self._machine, self._dt_s, point, member=member)
             stream.operate_at(point)
-            part = self._path[:, first:last]
-            parts.append(stream.push(part, part))
+            parts.append(stream.push(command_mm[:, first:last], self._path[:, first:last]))
         return np.concatenate(parts, axis=1)
 
     def _shape(self, answer: Array, shaping: Shaping, at: Ints, out: Array) -> None:

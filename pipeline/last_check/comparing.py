@@ -43,9 +43,10 @@ _ANYWHERE = re.compile(
 """Lines of ours that may also stand outside of streams: dwells, limits, the firmware's shaper."""
 _SHAPER = re.compile(rb"SET_INPUT_SHAPER|M593(?!\d)|M493(?!\d)", re.IGNORECASE)
 """The file's own shaper line, which we repeat, may contain other commands."""
+_STATE = re.compile(rb"G1 F[\d.]+$|G9[01]$|M8[23]$|G92 E-?[\d.]+$", re.IGNORECASE)
+"""Lines of ours that set the file's modes again, also behind a mark by which hosts skip objects."""
 _IN_STREAM = re.compile(
-    _ANYWHERE.pattern + rb"|G1 (?:[XYZEF]-?[\d.]+ ?)+$|G9[01]$|M8[23]$|G92 E-?[\d.]+$",
-    re.IGNORECASE,
+    rb"%b|%b|G1 (?:[XYZEF]-?[\d.]+ ?)+$" % (_ANYWHERE.pattern, _STATE.pattern), re.IGNORECASE
 )
 
 
@@ -208,7 +209,7 @@ class LastCheck:
             self._check(self._before.state, mask, code, original.line)
             self._count(original.line)
             self._original.skip()
-        elif _ANYWHERE.match(code) or _SHAPER.search(code):
+        elif _ANYWHERE.match(code) or _STATE.match(code) or _SHAPER.search(code):
             self._after.carry_out(code)
         else:
             raise self._strange(code, expected)

@@ -69,7 +69,7 @@ def _reason(request: Request) -> tuple[str, str] | None:
     store: JobStore = request.app.state.store
     storage: Storage = request.app.state.storage
     try:
-        store.oldest_queued_at()
+        store.check()
     except StoreError as error:
         return "database", str(error)
     try:

@@ -310,17 +310,28 @@ def _unpack(source: Path, folder: Path) -> Manifest:
 
 
 def _hold_back(database: Path) -> None:
-    """Prevent automatic starts of printers, which may have happened already."""
+    """Prevent starts of printers and uploads to them, which may have happened already.
+
+    A printer may have a later file of the name by now, of which the backup does not know.
+    """
     if not database.exists():
         return
-    why = "held back: it was due when the backup was made that was restored since"
+    why = (
+        "held back: it was due when the backup was made that was restored since, and the printer "
+        "may have a later file; download the result, or submit the file again"
+    )
     with contextlib.closing(sqlite3.connect(database)) as connection:
         tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master")}
         if {"jobs", "deliveries"} <= tables:
             connection.execute(
                 "UPDATE deliveries SET state = 'failed', error = ? "
-                "WHERE state IN ('waiting', 'sending') AND kind = 'printer' "
-                "AND job_id IN (SELECT id FROM jobs WHERE print_after)",
+                "WHERE state IN ('waiting', 'sending') AND kind = 'printer'",
+                (why,),
+            )
+            connection.execute(
+                "INSERT INTO deliveries (job_id, kind, target, state, attempts, next_at, error) "
+                "SELECT id, 'printer', printer, 'failed', 0, 0, ? FROM jobs "
+                "WHERE state IN ('queued', 'running') AND printer IS NOT NULL",
                 (why,),
             )
             connection.execute(

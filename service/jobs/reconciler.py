@@ -279,11 +279,20 @@ class Reconciler:
         now, begun = time.monotonic(), 0
         left_alone = [job_id for job_id, (_, until) in self._no_room.items() if until > now]
         exclude = [*self._in_flight, *left_alone]
-        for job in self._store.next_queued(most, short=short, exclude=exclude):
-            if job.waits_for_room and not self._may_retry_for_room(job, now):
-                continue
-            self._in_flight[job.id] = (job, self._cluster.submit(job, self._wake.set))
-            begun += 1
+        skipped = 0
+        while begun < most:
+            # However many wait for room: those behind them may have it.
+            limit = most - begun + skipped
+            jobs = self._store.next_queued(limit, short=short, exclude=exclude)
+            for job in jobs:
+                exclude.append(job.id)
+                if job.waits_for_room and not self._may_retry_for_room(job, now):
+                    skipped += 1
+                elif begun < most:
+                    self._in_flight[job.id] = (job, self._cluster.submit(job, self._wake.set))
+                    begun += 1
+            if len(jobs) < limit:
+                break
         return begun
 
     def _is_room(self) -> bool:

@@ -24,12 +24,13 @@ from sqlalchemy import (
     func,
     or_,
     select,
+    text,
     tuple_,
     update,
 )
 
 from stillpath.service.database import tables
-from stillpath.service.database.engine import insert, reading, write_together, writing
+from stillpath.service.database.engine import DatabaseAway, insert, reading, write_together, writing
 from stillpath.service.jobs.queue_order import queue_order
 from stillpath.service.jobs.state import (
     WAITING_FOR_ROOM,
@@ -209,6 +210,23 @@ class JobStore:
             return connection.execute(
                 select(func.min(_JOBS.created_at)).where(_JOBS.state == "queued")
             ).scalar()
+
+    def check(self) -> None:
+        """See whether jobs can be stored.
+
+        Raises
+        ------
+        DatabaseAway
+            If the database does not answer, or takes no writes: a standby, or one that is full.
+        """
+        with reading(self.engine) as connection:
+            connection.execute(select(_JOBS.id).limit(1))
+            on_server = self.engine.dialect.name == "postgresql"
+            if on_server and connection.scalar(text("SHOW transaction_read_only")) == "on":
+                shown = self.engine.url.render_as_string(hide_password=True)
+                raise DatabaseAway(
+                    f"the database {shown} takes no writes; see whether it is a standby or full"
+                )
 
     def waiting_for_room(self) -> tuple[int, int]:
         """Return how many jobs wait for disk space, and the largest need of one."""
@@ -394,14 +412,18 @@ def _note_deliveries(connection: Connection, job: Job) -> None:
         due["printer"] = job.printer
     for kind, target in due.items():
         if target is not None:
+            # A restore has held it back where there is one already.
             connection.execute(
-                tables.deliveries.insert().values(
+                insert(connection, tables.deliveries)
+                .values(
                     job_id=job.id,
                     kind=kind,
                     target=target,
                     state="waiting",
+                    attempts=0,
                     next_at=job.finished_at,
                 )
+                .on_conflict_do_nothing()
             )
 
 

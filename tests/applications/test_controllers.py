@@ -194,6 +194,7 @@ REFUSED: list[tuple[str, dict[str, Any], str]] = [
     ("galvo-camera", FMSDOB, "every 3th one"),
     ("galvo-camera", {"method": "mmp", "targets_hz": [5000 / 3]}, "singular|told apart"),
     ("galvo-40khz", {"method": "rc-quasi", "fundamental_hz": 1201}, "rc-wide"),
+    ("galvo-40khz", {"method": "rc-wide", "fundamental_hz": 20}, "take a multiple of the fund"),
     ("galvo-40khz", FMSDOB | {"duration_s": 50}, "200000"),
     ("galvo-10khz", {"method": "fmsdob-adaptive", "floor_rms": 100}, "no tone"),
     ("galvo-10khz", {"method": "fmsdob-adaptive", "uncertainty": 2}, "allows"),

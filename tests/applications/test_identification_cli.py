@@ -29,6 +29,7 @@ from tests.models.identification.recordings import (
     one_mode,
     quick_raw,
 )
+from tests.models.test_ripple import ripple
 from tests.service.machines import make_machine
 
 MINE = make_machine(kinematics="cartesian")
@@ -156,10 +157,13 @@ def test_a_new_machine_needs_a_base(store: MachineStore, folder: Path, capsys) -
         assert why in one_line(capsys)
     assert identify(file, "-m", "mine", "--base", "ender3") == 2
     assert "leave out --base" in one_line(capsys)
-    assert identify(file, "-m", "new", "--base", "ender3", "--title", "New one") == 0
+    base = load_machine("ender3").model_copy(update={"ripple": {"x": ripple()}})
+    (folder / "base.json").write_text(base.model_dump_json())
+    arguments = ("-m", "new", "--base", folder / "base.json", "--title", "New one")
+    assert identify(file, *arguments) == 0
     machine = store.current("new").machine
     assert (machine.name, machine.title) == ("new", "New one")
-    assert machine.source == "travel, limits, axis Y of Creality Ender 3 (ender3)"
+    assert machine.source == "travel, limits, axis Y, ripple of X of Creality Ender 3 (ender3)"
     assert machine.firmware == load_machine("ender3").firmware
 
 
@@ -309,6 +313,7 @@ def test_one_broken_file_among_good_ones(store: MachineStore, folder: Path, caps
         ("{file} --report {file}", "--report"),
         ("{folder}/none.csv", "none.csv"),
         ("{folder}", "cannot read"),
+        ("{folder}/a@b.csv", "a@b.csv: No such file"),
         ("{file} {file}", "is a copy of raw_data_x_20260101_120000.csv"),
         ("{file}@+0.5lb", "neither a weight"),
         ("{file}@+0.5kg", "every run has a weight"),

@@ -57,6 +57,9 @@ def test_revisions_of_a_machine(folder: Path) -> None:
     store = MachineStore(folder / "data" / "machines")
     current = store.current("mine")
     assert current.number == 2
+    base = machine()
+    told = f"all but the ripple of axis X is of {base.title} ({base.name}): {base.source}"
+    assert current.machine.source == told
     amplitude = current.machine.ripple["x"].sources[0].harmonics[0].amplitude_um
     assert amplitude == pytest.approx(15.0, rel=0.01)
 
@@ -69,6 +72,15 @@ def test_refusals_leave_nothing(folder: Path, capsys: pytest.CaptureFixture[str]
     assert not out.exists()
     assert run(["identify", str(folder / "pass.csv"), "--ripple", "belt:2"]) == 2
     assert "--axis" in capsys.readouterr().err
+    (folder / "pass.csv").write_text(log())
+    (folder / "again.csv").write_text(log())
+    for more, word in (
+        (("--gain", "1.5"), "gain 1.5"),
+        ((str(folder / "again.csv"),), "is a copy"),
+    ):
+        assert learn(folder, *more, "-m", "mine", "--base", str(folder / "base.json")) == 2
+        assert word in capsys.readouterr().err
+    assert "mine" not in MachineStore(folder / "data" / "machines")
 
 
 def test_a_report_that_ripple_has_not_is_refused(

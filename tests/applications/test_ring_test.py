@@ -29,6 +29,7 @@ from stillpath.models.confirmation import Confirmation, confirmation_text, plant
 from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
 from stillpath.models.plants import FirSpec, PlantSetSpec, PlantSpec
+from stillpath.models.ripple import AxisRipple, RippleHarmonic, RippleSource
 from stillpath.models.store import load_machine
 from tests.service.ringing import SENSOR, TRUE, Chain, machine_of, recorded
 
@@ -211,6 +212,22 @@ def test_friction_that_is_known_counts_in_what_is_predicted(
         assert smooth.compensated is not None
         wanted = pytest.approx(smooth.compensated.predicted_um, rel=0.3)
         assert axis.compensated.predicted_um == wanted
+
+
+def test_ripple_that_is_known_counts_in_what_is_predicted(
+    machine: Machine, cache: Path, tmp_path: Path
+) -> None:
+    """Of belts, whose teeth pass by with some 60 Hz."""
+    harmonics = (RippleHarmonic(number=1, amplitude_um=10.0, phase_deg=10.0),)
+    belt = AxisRipple(sources=(RippleSource(name="belt", pitch_mm=2.0, harmonics=harmonics),))
+    rippled = machine.model_copy(update={"ripple": {"a": belt, "b": belt}})
+    ring = tmp_path / "ring.gcode"
+    write_ring_test(rippled, ring, cache_dir=cache)
+    content = recorded(ring, rippled).raw_data()
+    told = said_of(tmp_path / "a.csv", ring, rippled, content)
+    assert verdicts(told) == ["confirmed", "confirmed"]
+    blind = said_of(tmp_path / "a.csv", ring, machine, content)
+    assert verdicts(blind) == ["not confirmed", "not confirmed"]
 
 
 def test_a_copy_of_a_log_is_no_repeat(

@@ -386,6 +386,22 @@ def test_what_is_done_counts_though_nobody_listens(closed: str):
     assert ran.stderr == ("" if closed.startswith("2") else "done\n")
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is full")
+def test_a_full_disk_below_the_output_is_named():
+    program = "from stillpath.cli.main import main; main()"
+    with Path("/dev/full").open("w") as full:
+        ran = subprocess.run(
+            [sys.executable, "-c", program, "--version"],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+        )
+    assert ran.returncode == 1
+    assert ran.stderr.startswith("stillpath: error: standard output: No space left on device; ")
+    assert ran.stderr.count("\n") == 1
+
+
 def test_names_are_shown_as_they_are(pipeline, source, tmp_path, capsys, monkeypatch):
     name = "part[bold]:x:[/red].gcode"
     made = make_result(layers=2).model_copy(update={"source_name": name})

@@ -135,6 +135,26 @@ def test_a_machine_through_its_life(store: MachineStore, tmp_path: Path, capsys)
     assert store.current("mine").restored == 1
 
 
+def test_an_old_export_says_that_newer_plants_are_replaced(
+    store: MachineStore, tmp_path: Path, capsys
+):
+    plants = {**make_machine().axes, "y": make_plants(44.0)}
+    store.add_revision("mine", make_machine(), author="anna")
+    file = tmp_path / "old.json"
+    assert machines("export", "mine", "-o", file) == 0
+    for revision in (make_machine(axes=plants), make_machine(axes=plants, mesh_slope=0.02)):
+        file.write_text(revision.model_dump_json())
+        capsys.readouterr()
+        assert machines("put", file) == 0
+        assert "newer" not in capsys.readouterr().out
+    file.write_text(make_machine(mesh_slope=0.03).model_dump_json())
+    assert machines("put", file) == 0
+    shown = capsys.readouterr().out
+    assert "axis Y: the plants are those of revision 1 again" in shown
+    assert "machines rollback mine 3" in shown
+    assert "axis X" not in shown
+
+
 def test_export_and_import(store: MachineStore, tmp_path: Path, capsys):
     store.add_revision("mine", make_machine(), author="anna")
     store.add_revision("mine", make_machine(mesh_slope=0.02), author="anna")

@@ -19,6 +19,8 @@ from stillpath.gcode.errors import GcodeError
         (b"a cube".ljust(80) + b"\1\0\0\0".ljust(48), "STL"),
         (b"\x1f\x8b\x08\x00", "gzip"),
         (b'{\r\n  "name": "mine"}\n', "JSON"),
+        (b'[\n {"t_s": 0.0}\n]\n', "JSON"),
+        (b"[1, 2]", "JSON"),
     ],
 )
 def test_it_says_what_the_file_is(tmp_path: Path, head: bytes, word: str) -> None:
@@ -36,7 +38,7 @@ def test_an_empty_file_is_called_so(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", [b"\n", b"%\nG28\n", b";solid\nG28\n", b"G28", b"<x\n", b"{if x}\n"]
+    "text", [b"\n", b"%\nG28\n", b";solid\nG28\n", b"G28", b"<x\n", b"{if x}\n", b"[start]\n"]
 )
 def test_gcode_is_not_taken_for_it(tmp_path: Path, text: bytes) -> None:
     path = tmp_path / "part.gcode"

@@ -119,24 +119,36 @@ class Klipper:
         self.state = "standby"
         self._macros: dict[str, _Macro] = {}
         self._help: dict[str, str] = {}
+        self._delayed: dict[str, str] = {}
+        self._due: list[str] = []
         self._commands: dict[str, Callable[[str, dict[str, str]], None]] = {
             "PAUSE": self._pause,
             "RESUME": self._resume,
             "CANCEL_PRINT": self._cancel,
             "SET_VELOCITY_LIMIT": self._limit,
             "SET_GCODE_VARIABLE": self._variable,
+            "UPDATE_DELAYED_GCODE": self._delay,
         }
         if "input_shaper" in self.settings:
             self._commands["SET_INPUT_SHAPER"] = self._shape
         for section, options in self.sections:
             if section.startswith("gcode_macro "):
                 self._load(section, options)
+            elif section.startswith("delayed_gcode "):
+                self._delayed[section.split()[1]] = options["gcode"]
         for macro in self._macros.values():
             if macro.renames is not None:
                 self._rename(macro)
 
     def run(self, script: str) -> None:
-        """Run a script, line by line."""
+        """Run a script, line by line, and behind it what it delayed, even if it fails."""
+        try:
+            self._run(script)
+        finally:
+            while self._due:
+                self._run(self._delayed[self._due.pop()])
+
+    def _run(self, script: str) -> None:
         for full in script.split("\n"):
             line = full.strip()
             name = line.partition(" ")[0].upper()
@@ -231,7 +243,7 @@ class Klipper:
         macro.running = True
         try:
             # The whole template is expanded before its first line runs.
-            self.run(macro.template.render(context))
+            self._run(macro.template.render(context))
         finally:
             macro.running = False
 
@@ -280,6 +292,9 @@ class Klipper:
             self.shaper[name.lower()] = value if "TYPE" in name else float(value)
         told = (f"{name}:{value}" for name, value in self.shaper.items())
         self.told.append(" ".join(told))
+
+    def _delay(self, line: str, given: dict[str, str]) -> None:
+        self._due.append(given["ID"])
 
     def _variable(self, line: str, given: dict[str, str]) -> None:
         macro = self._macros[given["MACRO"]]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import re
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from stillpath.compensation.shapers import shape_xy
 from stillpath.gcode.containers.opening import open_text, rewriting
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.registry import adapter
@@ -21,14 +23,19 @@ from stillpath.models.firmware.reprapfirmware import Drive
 from stillpath.models.machine import Machine
 from stillpath.models.plant_specs import ParametricMembers, RelativeMode, RelativeModesSpec
 from stillpath.models.schedule import AxisSchedule, MassSchedule
+from stillpath.models.shaping import AxisShaper, Shaping
 from stillpath.models.store import load_machine
 from stillpath.pipeline.advising import removing
 from stillpath.pipeline.advising.inserting import MARK
 from stillpath.pipeline.advising.removing import remove_advice
+from stillpath.pipeline.advising.trials import Trial
 from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.options import Options
+from stillpath.pipeline.pacing.samples import take_samples
+from stillpath.pipeline.reading import dialect_for
 from stillpath.pipeline.result import Result
 from stillpath.pipeline.simulate import simulate_file
+from stillpath.simulation.scheduled import MachineStream
 from tests.compensating import compensated
 from tests.gcode.container_files import binary
 from tests.gcode.prints import polygon
@@ -205,6 +212,25 @@ def test_without_a_budget_nothing_gets_worse_or_slower(tmp_path: Path, cache: Pa
         if feature.bound_um is not None:
             assert feature.after_um <= feature.before_um * 1.001
     assert result.time_s <= result.original_time_s
+
+
+@pytest.mark.parametrize("friction_mm", [None, 0.03])
+def test_trials_shape_what_the_guides_receive(friction_mm: float | None) -> None:
+    """Shaper and friction do not commute."""
+    machine = machine_of(Klipper())
+    update = {"friction_mm": friction_mm}
+    axes = {a: plants.model_copy(update=update) for a, plants in machine.axes.items()}
+    machine = machine.model_copy(update={"axes": axes})
+    dialect = dialect_for(machine, None)
+    samples = take_samples(io.BytesIO(printed()), machine, dialect)
+    trial = Trial(samples, {}, machine, adapter(machine).adviser(dialect), 1e-3, [None])
+    shaping = Shaping(AxisShaper("ei", 45.0), AxisShaper("ei", 35.0))
+    command = shape_xy(trial._path, 1e-3, (shaping.x.pulses(), shaping.y.pulses()))
+    moved = MachineStream(machine, 1e-3).push(command, trial._path)
+    for feature, at in trial._index.items():
+        error_um = 1e3 * trial._distance.at(moved[:, at], at)
+        wanted = pytest.approx(np.sqrt(np.mean(error_um**2)), rel=2e-3)
+        assert trial.errors(shaping)[feature] == wanted
 
 
 @pytest.mark.parametrize(("f_hz", "pauses", "kept"), [(45.0, 1, True), (12.0, 20, False)])

@@ -35,7 +35,7 @@ ON = {
     "reprapfirmware": re.compile(r'M593 P"zvd"'),
 }
 OFF = {
-    "klipper": re.compile(r"SET_INPUT_SHAPER SHAPER_FREQ_X=0 SHAPER_FREQ_Y=0$"),
+    "klipper": re.compile(r"SET_INPUT_SHAPER SHAPER_FREQ_X=0 SHAPER_FREQ_Y=0( SMOO|$)"),
     "marlin": re.compile(r"M593 F0$"),
     "reprapfirmware": re.compile(r'M593 P"none"$'),
 }

@@ -54,6 +54,20 @@ def test_a_machine_without_ripple_says_so(tmp_path: Path, cache: Path) -> None:
     assert not (tmp_path / "out.gcode").exists()
 
 
+@pytest.mark.parametrize(("accel_mm_s2", "said"), [(20_000.0, []), (6000.0, ["8 s of extruding"])])
+def test_ripple_that_the_limits_leave_no_room_for_is_told(
+    accel_mm_s2: float, said: list[str], tmp_path: Path, cache: Path
+) -> None:
+    machine = rippled()
+    command = machine.command.model_copy(update={"accel_mm_s2": accel_mm_s2})
+    machine = machine.model_copy(update={"command": command})
+    result, _ = compensated(
+        print_file(), tmp_path, cache, machine, method="shaper:mzv+ripple", tolerance_um=1.0
+    )
+    found = [w.partition("the ripple of ")[2] for w in result.warnings if "the ripple of" in w]
+    assert [w.partition(" is not compensated")[0] for w in found] == said
+
+
 def test_methods() -> None:
     for method in ("fbf+ripple", "none+ripple", "zpetc+ripple", "shaper:mzv+ripple"):
         assert Options(method=method).method == method

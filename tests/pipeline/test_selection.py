@@ -13,6 +13,7 @@ from stillpath.gcode.errors import GcodeError
 from stillpath.models.machine import Machine
 from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.options import Options
+from stillpath.pipeline.progress import Progress, ProgressCallback
 from stillpath.pipeline.result import Result
 from tests.gcode.cutting import ender3_with
 from tests.gcode.plain_reader import Firmware, read
@@ -47,9 +48,15 @@ def written(gear: Path) -> Written:
     return make
 
 
-def run(gear: Path, target: Path, machine: Machine, **options: object) -> Result:
-    chosen = Options.model_validate(options)
-    return compensate_file(gear, target, machine, chosen, cache_dir=gear.parent / "cache")
+def run(
+    gear: Path,
+    target: Path,
+    machine: Machine,
+    progress: ProgressCallback | None = None,
+    **options: object,
+) -> Result:
+    chosen, cache = Options.model_validate(options), gear.parent / "cache"
+    return compensate_file(gear, target, machine, chosen, cache_dir=cache, progress=progress)
 
 
 def rms(result: Result, feature: str) -> dict[str, float]:
@@ -147,7 +154,13 @@ def test_a_file_that_must_not_be_large(gear: Path, written: Written, tmp_path: P
         (1e-6 * sizes[1] + 1e-3, "visible", 2),
         (1e-6 * (sizes[1] - 9), "visible", 8),  # surfaces shake before they are left out
     ):
-        found = run(gear, target, machine, max_mb=limit_mb)
+        shown: list[Progress] = []
+        found = run(gear, target, machine, shown.append, max_mb=limit_mb)
+        # It goes on while the file is written again.
+        fractions = [now.fraction for now in shown if now.stage != "done"]
+        assert fractions == sorted(fractions)
+        assert len(set(fractions)) > 0.5 * len(fractions)
+        assert shown[-1].fraction == 1.0
         chosen = (
             f"max_mb={limit_mb:g}: written with where={where} and tolerance_um={tolerance_um:g}"
         )

@@ -10,6 +10,7 @@ import numpy as np
 
 from stillpath.models.machine import Machine
 from stillpath.models.plants import ParametricMembers, PlantSetSpec, PlantSpec, TfSpec
+from stillpath.models.ripple import MachineRipple
 from stillpath.models.store import load_machine
 from stillpath.pipeline.file_motion import TextMotion
 from stillpath.pipeline.reading import dialect_for
@@ -94,6 +95,7 @@ def recorded(
     with ring.open("rb") as file:
         motion = TextMotion(file, machine, dialect_for(machine, None), STEP_S)
         command = np.concatenate([part.samples.xyz_mm[:2] for part in motion], axis=1)
+    command = MachineRipple(machine.kinematics, machine.ripple).received_mm(command)
     felt = np.zeros((3, command.shape[1]))
     for k, (axis, chain) in enumerate(true.items()):
         along = (1.0, 0.0) if axis == "x" else (0.0, 1.0)

@@ -45,6 +45,7 @@ def test_revisions_are_compared_approved_and_brought_back(visitor: Visitor, serv
     dialog.get_by_role("button", name="Approve").click()
     revisions = page.get_by_role("region", name="Revisions, newest first")
     expect(revisions).to_contain_text("clara")
+    expect(page.locator("h1")).to_be_focused()
     page.get_by_role("button", name="Go back to revision 1").click()
     page.get_by_role("dialog").get_by_role("button", name="Go back").click()
     expect(revisions).to_contain_text("Back to 1")

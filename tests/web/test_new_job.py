@@ -305,13 +305,23 @@ def test_a_job_is_cancelled_and_deleted(visitor: Visitor, service: Service):
     page.get_by_role("dialog").get_by_role("button", name="Cancel the job").click()
     expect(page.locator(".badge[data-state=cancelled]")).to_be_visible()
     assert service.finished(job)["state"] == "cancelled"
+    # What had the focus is gone: reading goes on at the heading, not at the top of the window.
+    expect(page.locator("h1")).to_be_focused()
 
-    page.get_by_role("link", name="Jobs", exact=True).first.click()
+    page = visitor.open("#/jobs")
     page.get_by_role("button", name="Cancelled").click()
     row = page.locator(f"[data-job='{job}']")
-    row.get_by_role("button", name=f"Delete {name}").click()
+    delete = row.get_by_role("button", name=f"Delete {name}")
+    delete.click()
+    with page.expect_response(re.compile(r"/v1/jobs\?")):  # the list is drawn anew
+        pass
+    page.wait_for_timeout(100)
+    page.get_by_role("dialog").get_by_role("button", name="Keep it").click()
+    expect(delete).to_be_focused()
+    delete.click()
     page.get_by_role("dialog").get_by_role("button", name="Delete").click()
     expect(row).to_have_count(0)
+    expect(page.locator("h1")).to_be_focused()
     assert service.api.get(f"/v1/jobs/{job}").status_code == 404
 
 

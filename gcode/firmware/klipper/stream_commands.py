@@ -37,6 +37,7 @@ class KlipperStreamCommands:
     coarse_extruder = False
     one_command = True
     ignores_subcodes = False
+    marks = True
     factors_need_axes = False
     advance_off = b""
 
@@ -61,7 +62,7 @@ class KlipperStreamCommands:
     def _smoothers(self, *, on: bool) -> str:
         """Return the words to which smoothers of forks listen, which pass over SHAPER_FREQ."""
         if (s := self._shaper) is None:
-            return ""
+            return " SMOOTHER_FREQ_X=0 SMOOTHER_FREQ_Y=0"  # Klipper's own shapers pass over them
         axes = (("X", s.type_x, s.freq_x_hz), ("Y", s.type_y, s.freq_y_hz))
         return "".join(
             f" SMOOTHER_FREQ_{axis}={f_hz if on else 0:g}"

@@ -43,6 +43,7 @@ class MarlinStreamCommands:
     coarse_extruder = True
     one_command = True
     ignores_subcodes = True
+    marks = False
     factors_need_axes = False
     advance_off = b""
     file_shaper_off = b"M593 F0\n"

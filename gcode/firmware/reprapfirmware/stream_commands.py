@@ -46,6 +46,7 @@ class RepRapStreamCommands:
     coarse_extruder = False
     one_command = False
     ignores_subcodes = False
+    marks = False
     factors_need_axes = True
 
     def __init__(self, firmware: RepRapFirmware, pressure_advance_s: float) -> None:

@@ -1,6 +1,6 @@
 /** Questions before something is lost. */
 
-import { h } from "./dom.js";
+import { focusHeading, h } from "./dom.js";
 
 /**
  * Ask; the safe answer has the focus.
@@ -25,10 +25,19 @@ export function confirmed({ title, text, yes, no = "Keep it", danger = true, fie
     dialog.addEventListener("close", () => {
       removeEventListener("hashchange", left);
       dialog.remove();
-      if (before?.isConnected) before.focus();
+      returnFocus(before);
       resolve(dialog.returnValue === "yes");
     });
     document.body.append(dialog);
     dialog.showModal();
   });
+}
+
+/** What asked may have been drawn anew meanwhile. @param {HTMLElement | null} before */
+function returnFocus(before) {
+  const again = before?.dataset.focus && document.querySelector(`[data-focus="${CSS.escape(before.dataset.focus)}"]`);
+  const to = /** @type {HTMLElement | null} */ (before?.isConnected ? before : again || null);
+  const main = document.querySelector("main");
+  if (to !== null) to.focus();
+  else if (main !== null) focusHeading(main);
 }

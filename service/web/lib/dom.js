@@ -43,6 +43,31 @@ export function hide(part, isHidden) {
 }
 
 /**
+ * Put the focus where reading starts.
+ *
+ * @param {HTMLElement} main
+ */
+export function focusHeading(main) {
+  const heading = main.querySelector("h1");
+  if (heading === null) return main.focus();
+  heading.setAttribute("tabindex", "-1");
+  heading.focus({ preventScroll: true });
+}
+
+/**
+ * Do something that may replace the element with the focus, which then goes where reading starts.
+ *
+ * @param {Element} area
+ * @param {() => void} replace
+ */
+export function keepingFocus(area, replace) {
+  const held = area.contains(document.activeElement);
+  replace();
+  const main = document.querySelector("main");
+  if (held && document.activeElement === document.body && main !== null) focusHeading(main);
+}
+
+/**
  * Return the ids that tie a label to its field.
  *
  * @param {string} stem

@@ -1,7 +1,7 @@
 /** Views by the address's hash: `#/jobs/ID`. One is shown at a time, and ends when another comes. */
 
 import { isAbort } from "./api.js";
-import { fill, h } from "./dom.js";
+import { fill, focusHeading, h } from "./dom.js";
 import { retryPanel, unreachable } from "./problem.js";
 
 /**
@@ -64,18 +64,6 @@ export function startRouter(main, routes) {
     if (location.hash === "" || location.hash.startsWith("#/")) show();
   });
   show();
-}
-
-/**
- * Put the focus where reading starts.
- *
- * @param {HTMLElement} main
- */
-export function focusHeading(main) {
-  const heading = main.querySelector("h1");
-  if (heading === null) return main.focus();
-  heading.setAttribute("tabindex", "-1");
-  heading.focus({ preventScroll: true });
 }
 
 /** @param {string} name */

@@ -3,7 +3,7 @@
 import { getJson, isAbort, request } from "../lib/api.js";
 import { announce } from "../lib/announce.js";
 import { confirmed } from "../lib/dialog.js";
-import { fill, h } from "../lib/dom.js";
+import { fill, h, keepingFocus } from "../lib/dom.js";
 import { when } from "../lib/format.js";
 import { problemPanel } from "../lib/problem.js";
 import { table } from "../parts/table.js";
@@ -23,7 +23,7 @@ export async function revisionPanel(where, name, signal) {
   async function load() {
     const { revisions, drift } = await getJson(`${where}/revisions`, { signal });
     const newest = [...revisions].reverse();
-    fill(area,
+    keepingFocus(area, () => fill(area,
       drift.length ? h("ul.notice", null, drift.map((/** @type {any} */ d) => h("li", null, d.text))) : null,
       table("Revisions, newest first", [{ title: "Revision", text: true }, { title: "Who and why", text: true }, { title: "Approved", text: true }],
         newest.map((r, k) => [
@@ -33,7 +33,7 @@ export async function revisionPanel(where, name, signal) {
             r.approval ? h("span.badge", { dataset: { state: "done" }, title: when(r.approval.when) }, `by ${r.approval.author}`) : h("button", { type: "button", "aria-label": `Approve revision ${r.number}`, onclick: () => approve(r.number) }, "Approve"),
             k === 0 ? null : h("button", { type: "button", "aria-label": `Go back to revision ${r.number}`, onclick: () => rollBack(r.number, newest[0]) }, "Go back")),
         ])),
-      revisions.length > 1 ? comparison(newest) : null);
+      revisions.length > 1 ? comparison(newest) : null));
   }
 
   function comparison(/** @type {any[]} */ revisions) {

@@ -3,7 +3,7 @@
 import { getJson, isAbort, request } from "../lib/api.js";
 import { announce } from "../lib/announce.js";
 import { confirmed } from "../lib/dialog.js";
-import { fill, h } from "../lib/dom.js";
+import { fill, h, keepingFocus } from "../lib/dom.js";
 import { bytes, when } from "../lib/format.js";
 import { problemPanel, retryPanel } from "../lib/problem.js";
 import { isOver, watchJob } from "../lib/watch.js";
@@ -35,7 +35,7 @@ export async function show({ main, signal, setTitle, params: [id] }) {
     const isNews = state !== "";
     state = job.state;
     fill(badge, stateBadge(state));
-    fill(actions, isOver(job) ? deleteButton(job) : cancelButton(job));
+    keepingFocus(actions, () => fill(actions, isOver(job) ? deleteButton(job) : cancelButton(job)));
     if (isOver(job)) showDeliveries(sent, job, signal);
     if (!isOver(job)) fill(body, progress.element);
     else if (state === "done") {

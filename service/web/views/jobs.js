@@ -3,7 +3,7 @@
 import { getJson, isAbort, request } from "../lib/api.js";
 import { announce } from "../lib/announce.js";
 import { confirmed } from "../lib/dialog.js";
-import { fill, h } from "../lib/dom.js";
+import { fill, focusHeading, h } from "../lib/dom.js";
 import { bytes, duration, um, umOrRange, when } from "../lib/format.js";
 import { problemPanel, retryPanel } from "../lib/problem.js";
 import { isOver } from "../lib/watch.js";
@@ -102,7 +102,7 @@ export async function show({ main, signal, setTitle }) {
       await act();
       announce(said);
       await reload();
-      /** @type {HTMLElement | null} */ (main.querySelector("h1"))?.focus();
+      if (!signal.aborted) focusHeading(main);
     } catch (error) {
       if (!isAbort(error)) fill(fault, problemPanel(error));
     }

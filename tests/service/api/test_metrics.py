@@ -137,7 +137,7 @@ def test_not_ready_says_which_part(tmp_path: Path, monkeypatch):
             assert document["part"] == "storage"
             assert "bucket" not in str(document)  # which may have a name that not all should know
         with monkeypatch.context() as patch:
-            for name in ("oldest_queued_at", "counts", "page"):
+            for name in ("check", "oldest_queued_at", "counts", "page"):
                 patch.setattr(state.store, name, lambda *_, **__: database_away())
             assert_problem(client.get("/readyz"), 503, "database:")
             answer = client.get("/v1/jobs")

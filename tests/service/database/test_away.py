@@ -58,6 +58,8 @@ def test_postgresql_that_takes_no_writes(postgres_url: str, tmp_path: Path):
     with pytest.raises(DatabaseAway, match="read-only transaction"):
         store.add(make_job())
     assert store.counts()[JobState.QUEUED] == 0
+    with pytest.raises(DatabaseAway, match="takes no writes"):
+        store.check()  # as /readyz does
     engine.dispose()
 
 
@@ -68,6 +70,7 @@ def test_postgresql_behind_a_pooler(postgres_url: str, tmp_path: Path):
     store = JobStore(engine)
     for _ in range(20):
         store.counts()
+        store.check()
     with database.reading(engine) as connection:
         for kept in ("pg_prepared_statements", "pg_cursors", "pg_listening_channels()"):
             assert connection.scalar(text(f"SELECT count(*) FROM {kept}")) == 0

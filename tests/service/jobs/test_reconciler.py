@@ -12,7 +12,7 @@ import pytest
 
 from stillpath.service.jobs import reconciler
 from stillpath.service.jobs.reconciler import Reconciler
-from stillpath.service.jobs.state import WAITING_FOR_ROOM, Claimed, Job, JobState, Lost
+from stillpath.service.jobs.state import WAITING_FOR_ROOM, Claimed, Job, JobState, Lost, OutOfRoom
 from stillpath.service.jobs.worker import Workplace, execute
 from tests.service.jobs.site import Site
 from tests.service.runners import light
@@ -113,6 +113,19 @@ def test_a_print_is_not_started_days_after_it_was_expected(
     job_id = site.submit("G1", printer="left", print_after=True, created_at=created_at)
     look._tick()
     assert site.get(job_id).print_after == (min(away_h, submitted_h) < 1.0)
+
+
+def test_jobs_that_wait_for_room_let_others_pass(site: Site):
+    """However many there are: each is looked at again every half minute only."""
+    workers = Workers()
+    for number in range(6):
+        job_id = site.submit("G1", created_at=1000.0 + number)
+        if number < 5:
+            site.store.apply(job_id, Claimed(time.time(), "w"))
+            site.store.apply(job_id, OutOfRoom(1, time.time(), 1 << 60))
+    look = looking(site, workers)
+    look._tick()
+    assert list(look._in_flight) == [job_id]
 
 
 def test_a_job_waits_until_the_disk_of_the_storage_has_room(
