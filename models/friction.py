@@ -23,14 +23,43 @@ import numpy as np
 
 from stillpath.models._friction_kernels import bent, received
 from stillpath.models.arrays import Array
+from stillpath.models.plants import PlantSetSpec, frequency_response
 
-__all__ = ["BEND_MM", "CREEP_S", "DryFriction", "bend_of"]
+__all__ = [
+    "BEND_MM",
+    "CREEP_S",
+    "LEAST_MM_S2",
+    "DryFriction",
+    "bend_of",
+    "held_back_mm",
+    "with_least_friction",
+]
 
 BEND_MM = 0.01
 """Travel over which friction reverses: 5 to 20 um on rolling and sliding guides. Half or twice as
 much changes contour errors by a few per cent."""
 CREEP_S = 0.05
 """Time constant of a bend while an axis stands. 0.03 and 0.1 are about as good (docs/tried.md)."""
+LEAST_MM_S2 = 75.0
+"""Dry friction over moving mass that is assumed where none could be measured. Most guides rub more;
+more would make stiff printers with light guides worse (docs/tried.md)."""
+_SLOW_HZ = 3.0
+"""Well below all modes: there a plant follows its command but for the bend of its springs."""
+
+
+def held_back_mm(plants: PlantSetSpec, accel_mm_s2: float) -> float:
+    """Return how far an axis is held back by a friction force, given over its moving mass.
+
+    A force bends the springs of an axis as far as an acceleration that needs this force.
+    """
+    slow = frequency_response(plants.without_delay().nominal, np.array([_SLOW_HZ]))
+    bend_s2 = abs(float(slow.real[0]) - 1.0) / (2.0 * np.pi * _SLOW_HZ) ** 2
+    return accel_mm_s2 * bend_s2
+
+
+def with_least_friction(plants: PlantSetSpec) -> PlantSetSpec:
+    """Return plants whose measurement cannot show friction with the least that guides have."""
+    return plants.with_friction(held_back_mm(plants, LEAST_MM_S2), assumed=True)
 
 
 def bend_of(way_mm: Array, dt_s: float = 0.0) -> Array:

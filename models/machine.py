@@ -243,7 +243,7 @@ class Machine(Document):
 
     def without_friction(self) -> Machine:
         """Return the machine with guides that do not rub."""
-        axes = {k: v.model_copy(update={"friction_mm": None}) for k, v in self.axes.items()}
+        axes = {k: v.with_friction(None) for k, v in self.axes.items()}
         return self.model_copy(update={"axes": axes})
 
     def _check_command(self) -> None:

@@ -353,6 +353,18 @@ class PlantSetSpec(Document):
         self.weighted_members()
         return self
 
+    def with_friction(self, held_mm: float | None, *, assumed: bool = False) -> PlantSetSpec:
+        """Return the set with friction that holds the axis back so far; `assumed`: not measured."""
+        about = self.provenance
+        if about is not None:
+            about = about.model_copy(update={"friction": "assumed" if assumed else None})
+        return self.model_copy(update={"friction_mm": held_mm, "provenance": about})
+
+    @property
+    def friction_assumed(self) -> bool:
+        """Whether its friction was assumed, not measured."""
+        return self.provenance is not None and self.provenance.friction == "assumed"
+
     def without_delay(self) -> PlantSetSpec:
         """Return the set without what delays slow motion, where its plants say what that is."""
         if isinstance(self.members, ParametricMembers):

@@ -20,7 +20,7 @@ Phase: TypeAlias = Literal["not measured", "aligned at low frequency"]
 """How the phase was obtained. No recording of a printer shares its clock with the command, so what
 is measured is phase relative to slow motion, which is taken to be on time."""
 
-ADDED = ("phase", "slow_delay_s", "coherent_share", "coherent_band_hz")
+ADDED = ("phase", "slow_delay_s", "coherent_share", "coherent_band_hz", "friction")
 """Fields that older documents lack: where they are None, a document is as it was before them."""
 
 
@@ -65,6 +65,8 @@ class Provenance(Document):
         Of the measured frequencies, those at which the motion follows the command.
     coherent_band_hz : (float, float), optional
         Lowest and highest of these.
+    friction : str, optional
+        That the axis's friction was assumed, not measured (`models.friction.with_least_friction`).
     """
 
     kind: Kind
@@ -79,6 +81,7 @@ class Provenance(Document):
     slow_delay_s: tuple[Finite, Finite] | None = None
     coherent_share: Annotated[float, Field(ge=0, le=1)] | None = None
     coherent_band_hz: tuple[Positive, Positive] | None = None
+    friction: Literal["assumed"] | None = None
 
     @property
     def magnitude_only(self) -> bool:

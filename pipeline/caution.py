@@ -63,7 +63,7 @@ Pair: TypeAlias = tuple[DiscretePlant, DiscretePlant]
 Shares: TypeAlias = tuple[float, float]
 """Share of a command in its mixture with the shaper's, for X and Y."""
 
-_VERSION = 11
+_VERSION = 12
 _SHARES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.2, 0.0)
 _UNSEEN_SHARE = 0.85
 """Largest share where the phase was not measured: a set cannot warn of what it does not contain."""
@@ -211,7 +211,7 @@ def prediction_note(machine: Machine, choice: Choice) -> str:
 
 def _friction_unseen(machine: Machine) -> str:
     unseen_um = {
-        axis.upper(): 1e3 * unseen_friction_mm(plants)
+        axis.upper(): 1e3 * (unseen_friction_mm(plants) + (plants.friction_mm or 0.0))
         for axis, plants in sorted(machine.axes.items())
     }
     held = " and ".join(f"{um:.0f} µm ({axis})" for axis, um in unseen_um.items() if um)

@@ -14,10 +14,10 @@ from typing import TypeAlias
 import numpy as np
 
 from stillpath.models.arrays import Array
-from stillpath.models.friction import DryFriction
+from stillpath.models.friction import DryFriction, held_back_mm
 from stillpath.models.machine import Machine
 from stillpath.models.plant_specs import PlantSetSpec
-from stillpath.models.plants import DiscretePlant, frequency_response, plant_set
+from stillpath.models.plants import DiscretePlant, plant_set
 from stillpath.models.typed_in import stated_hz
 from stillpath.pipeline.result import Channel
 from stillpath.simulation.response import response
@@ -43,8 +43,6 @@ _STEPS_UNSURE = 0.2
 _LAG_UNSURE_S = 1.5e-4
 """Unknown delay of X against Y: alignment sets both to 0, but viscous guides may delay one; clocks
 of logs tell some of it (`models.identification.clocks`)."""
-_SLOW_HZ = 3.0
-"""Well below all modes: there a plant follows its command but for the bend of its springs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,13 +115,11 @@ class ErrorRange:
 def unseen_friction_mm(axis: PlantSetSpec) -> float:
     """Return how far friction that was not measured may hold an axis back; 0 if it was.
 
-    A friction force bends the springs of an axis as far as an acceleration that needs this force.
+    This comes on top of what is assumed.
     """
-    if axis.friction_mm is not None or not phase_unseen(axis):
+    if not phase_unseen(axis) or (axis.friction_mm is not None and not axis.friction_assumed):
         return 0.0
-    slow = frequency_response(axis.without_delay().nominal, np.array([_SLOW_HZ]))
-    bend_s2 = abs(float(slow.real[0]) - 1.0) / (2.0 * np.pi * _SLOW_HZ) ** 2
-    return _FRICTION_UNSEEN_MM_S2 * bend_s2
+    return held_back_mm(axis, _FRICTION_UNSEEN_MM_S2) - (axis.friction_mm or 0.0)
 
 
 def nominal_response(machine: Machine, command: Array, dt_s: float) -> Array:
@@ -154,7 +150,7 @@ def error_ranges(
         nominal = max(rms(nominal_response(machine, command, dt_s)), 1e-12)
         ratios = []
         for pair, side in zip(pairs, sides, strict=True):
-            received = _received(machine, command, dt_s, 1.0 + _FRICTION_UNSURE * side)
+            received = _received(machine, command, dt_s, side)
             ratios.append(rms(_delayed(response(pair, received), side * lag_s / dt_s)) / nominal)
         rubbed = nominal
         if any(unseen_mm):
@@ -167,10 +163,12 @@ def error_ranges(
     return out
 
 
-def _received(machine: Machine, command: Array, dt_s: float, share: float = 1.0) -> Array:
-    """Return a command after dry friction; `share` scales the measured friction."""
-    held_mm = [share * held for held in machine.friction_mm]
-    return DryFriction(held_mm, dt_s).received_mm(command)
+def _received(machine: Machine, command: Array, dt_s: float, side: float = 0.0) -> Array:
+    """Return a command after dry friction, or the most or least of it (`side` 1 or -1)."""
+    axes = (machine.axes["x"], machine.axes["y"])
+    unsure = np.where([axis.friction_assumed for axis in axes], 1.0, _FRICTION_UNSURE)
+    held_mm = np.multiply(machine.friction_mm, 1.0 + side * unsure)
+    return DryFriction(held_mm.tolist(), dt_s).received_mm(command)
 
 
 def _delayed(y: Array, samples: float) -> Array:

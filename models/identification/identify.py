@@ -37,6 +37,7 @@ from stillpath.models.identification.messages import (
     body_notes,
     by_file,
     fit_warnings,
+    friction_notes,
     level_warnings,
     mounting_notes,
     no_frame_note,
@@ -239,7 +240,7 @@ class _AxisWork:
                 self.late = []
                 found = self._from_magnitudes(found.fit, frame_likely)
         self._steps.stepped(f"axis {self._axis}: fitted")
-        notes = list(found.notes)
+        notes = [*found.notes, *friction_notes(found.plants)]
         used = [one.measurement for one in self._used]
         notes += by_file((m.source, n) for m in used for n in m.notes)
         for one in self._left_out:
@@ -467,7 +468,7 @@ class _AxisWork:
         return out
 
     def _rubbing(self, plants: PlantSetSpec) -> PlantSetSpec:
-        return plants.model_copy(update={"friction_mm": self._friction_mm or None})
+        return plants.with_friction(self._friction_mm) if self._friction_mm else plants
 
 
 def _frame(

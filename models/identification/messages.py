@@ -9,6 +9,7 @@ import numpy as np
 
 from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
+from stillpath.models.friction import LEAST_MM_S2
 from stillpath.models.identification.estimation import plateau_gain
 from stillpath.models.identification.nozzle import Frame
 from stillpath.models.identification.readers.checks import RANGE_ENDED
@@ -22,6 +23,7 @@ __all__ = [
     "cross_axis_warning",
     "fit_warnings",
     "frame_mode_notes",
+    "friction_notes",
     "level_warnings",
     "mounting_notes",
     "no_frame_note",
@@ -85,6 +87,18 @@ def body_notes(friction_mm: float, frame: Frame | None) -> list[str]:
             "does not move against the bed, so it was removed (frame_firm keeps it)"
         )
     return notes
+
+
+def friction_notes(plants: PlantSetSpec) -> list[str]:
+    """Return what is assumed of friction, which spectra do not show."""
+    if not plants.friction_assumed:
+        return []
+    held_um = 1e3 * (plants.friction_mm or 0.0)
+    note = (
+        f"dry friction was not measured (raw logs show it): {1e-3 * LEAST_MM_S2:g} N per kg of "
+        f"moving mass is assumed, which holds the axis {held_um:.1f} µm behind its command"
+    )
+    return [note]
 
 
 def frame_mode_notes(felt: RelativeModesSpec, kept: RelativeModesSpec) -> list[str]:

@@ -16,6 +16,7 @@ from pydantic import ValidationError
 
 from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
+from stillpath.models.friction import with_least_friction
 from stillpath.models.identification.averaging import mean_response
 from stillpath.models.identification.frame import LIKELY
 from stillpath.models.identification.modal_fit import fit_modes, refit
@@ -180,6 +181,7 @@ def spectrum_set(
             origin=origin,
         ),
     )
+    plants = with_least_friction(plants)
     return AxisIdentification(
         axis=axis, plants=plants, fit=fit, measured=explanations.spectra, warnings=fit.notes
     )

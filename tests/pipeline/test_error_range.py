@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from stillpath.compensation.shapers import ShaperCompensator
+from stillpath.models.friction import with_least_friction
 from stillpath.models.machine import Machine
 from stillpath.models.plants import PlantSetSpec, RelativeMode, RelativeModesSpec, WeightedMember
+from stillpath.models.provenance import Provenance
 from stillpath.models.reference_motion import reference_motion_of
 from stillpath.models.store import load_machine
 from stillpath.pipeline.error_range import error_ranges, unseen_friction_mm
@@ -15,6 +17,7 @@ from stillpath.simulation.measures import PathDistances
 from stillpath.simulation.printers.bodies import STEP_S, Bodies, Element, Friction
 
 DT_S = 1e-3
+TABLE = Provenance(kind="spectrum")
 
 
 def axis(f_hz: float, zeta: float = 0.06, friction_mm: float | None = None) -> PlantSetSpec:
@@ -42,6 +45,16 @@ def test_of_several_modes_the_soft_ones_bend_most() -> None:
     several = PlantSetSpec(nominal=RelativeModesSpec(modes=modes))
     expected = 1500.0 * sum(m.share / (2 * np.pi * m.f_hz) ** 2 for m in modes)
     assert unseen_friction_mm(several) == pytest.approx(expected, rel=0.02)
+
+
+def test_assumed_friction_is_part_of_what_is_unseen() -> None:
+    assumed = with_least_friction(axis(48.0).model_copy(update={"provenance": TABLE}))
+    assert assumed.friction_assumed
+    assert assumed.friction_mm == pytest.approx(75.0 / (2 * np.pi * 48.0) ** 2, rel=0.02)
+    whole_mm = assumed.friction_mm + unseen_friction_mm(assumed)
+    assert whole_mm == pytest.approx(unseen_friction_mm(axis(48.0)), rel=1e-12)
+    measured = assumed.with_friction(assumed.friction_mm)
+    assert unseen_friction_mm(measured) == 0.0
 
 
 def printer(f_hz: dict[str, float], force_n_kg: float) -> Bodies:
