@@ -88,6 +88,23 @@ def test_filament_of_any_print(kind: str, cache: Path, steps: list[tuple]) -> No
         assert after[tool] == pytest.approx(before[tool], abs=FILAMENT_MM)
 
 
+@pytest.mark.parametrize("change", ["M221 S80", "G92 E40", "G10\nG11", "G1 E2e0 F900\nG1E1.7"])
+def test_absolute_e_of_reprapfirmware(change: str, cache: Path) -> None:
+    """Most of its versions go on from the last absolute E, whatever a stream has fed since."""
+    e = 40.0 if "G92" in change else 1.7
+    text = START.replace("M83", "M82\nG92 E0").replace("E2.1", "E3.1")
+    text += f"G1 E1.7 F2100\nG1 Z.6\n{change}\nG1 X60 F6000\nG1 E{e + 1.4} F2100\nG1 Y60 E{e + 3}\n"
+    text += f"M400\nG1 X90 E{e + 4}\nG1 E{e + 3} F2100\nM83\nG1 Y90 E1\nM400\nG1 E-1\n"
+    written = check(text, "reprapfirmware", cache, reverts=False)
+    assert b"M83" in written
+    for how in (False, True):
+        before, after = (
+            read(data, "reprapfirmware", relative_moves_count=how).extruded_mm[0]
+            for data in (text.encode(), written)
+        )
+        assert after == pytest.approx(before, abs=FILAMENT_MM)
+
+
 @pytest.mark.parametrize("decimals", [5, 7])
 def test_retractions_far_from_zero_do_not_drift(decimals: int, cache: Path) -> None:
     """What Marlin's E is set back to has the digits of the file."""
