@@ -209,8 +209,8 @@ class MachineState:
                 if home_mm is not None:
                     f[at.F_LAST + k] = f[at.F_TOOL + k] = home_mm[k]
         i[at.I_ORIGIN_KNOWN] |= axes
-        # Homing an axis may move the others too (safe_z_home).
-        i[at.I_KNOWN] = 0 if home_mm is None else i[at.I_KNOWN] | axes
+        # Homing an axis may move the others too (safe_z_home, homex.g).
+        i[at.I_KNOWN] = 0 if home_mm is None else axes
         self.settle()
         self.note_modal()
 

@@ -49,12 +49,21 @@ def event_places(piece: Piece, encoded: Encoded) -> NDArray[np.int64]:
     return first[np.minimum(piece.events.move_index, len(piece.moves))]
 
 
-def written_modes(piece: Piece, index: NDArray[np.int64]) -> WrittenModes:
+def written_modes(piece: Piece, encoded: Encoded, index: NDArray[np.int64]) -> WrittenModes:
     """Return the modes; `index` is the written move before which each event is written."""
-    changes = piece.events.kind == EventKind.MODE
-    first = np.concatenate([[0], index[changes]])
+    moves, changes = piece.moves, piece.events.kind == EventKind.MODE
+    # G10 and G11 are moves, and a hop shifts the origin of Z.
+    rests = np.flatnonzero(encoded.row >= 0)
+    behind = moves.modal_id[np.minimum(encoded.row[rests] + 1, len(moves) - 1)]
+    shifts = behind != moves.modal_id[encoded.row[rests]]
+    first = np.concatenate([[0], rests[shifts] + 1, index[changes]])
     states = [piece.modal_before]
-    states += [piece.modal[int(m)] for m in piece.events.modal_id[changes]]
+    states += [
+        piece.modal[int(m)]
+        for m in np.concatenate([behind[shifts], piece.events.modal_id[changes]])
+    ]
+    order = np.argsort(first, kind="stable")
+    first, states = first[order], [states[k] for k in order.tolist()]
     # Of several changes at one move the last one counts.
     last = np.append(first[1:] != first[:-1], True)
     ours = [

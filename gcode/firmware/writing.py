@@ -172,7 +172,7 @@ class StreamWriter:
         parts = [self._on(piece, limits[level[0]], extruder_mm)]
         rows, events = encoded.row, piece.events
         index = event_places(piece, encoded)
-        modes = written_modes(piece, index)
+        modes = written_modes(piece, encoded, index)
         text, line_end, extruded = self._format(encoded, modes, index, events.kind)
 
         kinds = events.kind.tolist()

@@ -62,6 +62,9 @@ CASES = {
         "M221 S80\nM83\nG1 X60 E1\nG1 E1\nG1 Y60 E.5\nM82\nG1 X90 E0 F3000\nG1 Y80 E3\n"
         "M400\nG1 Y60 E4"
     ),
+    "a climb behind a hop of the firmware": (
+        "G1 Z.6\nM207 S1 F2400 Z.3\nG10\nG1 X60 Z.65 F1200\nG1 Y60 Z.6\nG11\nG1 X90 E2"
+    ),
     "M220 is not for the extruder alone": "M220 S80\nG1 X60 E2.2\nG1 E-1\nG1 Y60 E1\nG1 E1\nM400",
 }
 START = "G28\nG90\nM83\nG1 X60 Y60 F6000\nG1 X90 E2.3\nG1 Y90 E2.1\n"
