@@ -122,7 +122,8 @@ def tool(state: MachineState, command: Command) -> int:
     """T: another tool, or the one that is in use already."""
     digits = command.name[1:]
     if not digits.isdigit():
-        if not digits and state.dialect.expressions and not command.words:
+        reports = state.dialect.expressions and not command.words and "{" not in command.text
+        if not digits and reports:
             return state.event(EventKind.HARMLESS)  # T alone reports
         state.tool_known = False
         return state.event(EventKind.UNKNOWN)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from stillpath.gcode import _slots as at
 from stillpath.gcode._command_kernels import execute
 from stillpath.gcode._lex_kernels import PADDING, run
+from stillpath.gcode._motion_kernels import set_feed
 from stillpath.gcode.comments import note_comment
 from stillpath.gcode.dialect import Action, Dialect
 from stillpath.gcode.errors import GcodeError
@@ -329,7 +330,7 @@ class Interpreter:
             name = f"G{motion}"
         word = dialect.word(name)
         if command.uncertain:
-            return self._uncertain(word)
+            return self._uncertain(word, command)
         if isinstance(word, Action):
             return self._classic(word, name, command)
         if isinstance(word, EventKind):
@@ -338,11 +339,16 @@ class Interpreter:
             return state.event(word)
         return word(state, command)
 
-    def _uncertain(self, word: object) -> int:
+    def _uncertain(self, word: object, command: Command) -> int:
         """Pass a line by whose values only the firmware can work out."""
         state = self.state
-        if word == EventKind.HARMLESS:
-            return state.event(EventKind.HARMLESS)
+        if isinstance(word, EventKind) and word in (EventKind.HARMLESS, EventKind.STOP):
+            return state.event(word)
+        feed = command.words.get("F", "")
+        if isinstance(word, Action) and word <= Action.ARC_CCW and feed and "{" not in feed:
+            status = set_feed(state.f, state.i, state.number(feed, "F", command))
+            if status != at.OK:
+                return int(status)
         state.warn("the line holds an expression; from here on the position is not known")
         state.forget(origin=not isinstance(word, Action) or word >= Action.INCHES)
         return state.event(EventKind.UNKNOWN)

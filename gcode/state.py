@@ -245,7 +245,7 @@ class MachineState:
         for name, value in values.items():
             row[self.limits_names.index(name)] = value
         limits = self.f[at.F_LIMITS : at.F_LIMITS + len(row)]
-        remember = remember and self.f[at.F_UNIT_MM] == 1.0
+        remember = remember and kind == EventKind.LIMITS and self.f[at.F_UNIT_MM] == 1.0
         if remember and self.memo_limits < len(self.tables.memo_limits):
             self.tables.memo_limits[self.memo_limits] = row
             if self.remember(command, at.MEMO_LIMITS, self.memo_limits):
@@ -253,6 +253,13 @@ class MachineState:
         limits[:] = np.where(np.isnan(row), limits, row)
         note_limits(self.f, self.i, self.rows, self.tables)
         return self.event(kind)
+
+    def limits_kind(self, command: Command, letters: str) -> EventKind:
+        """Return the effect of a line of limits, of which a stream holds back those of `letters`.
+
+        Its further words (another axis) would be lost with it.
+        """
+        return EventKind.STATE if command.words.keys() - set(letters) else EventKind.LIMITS
 
     def remember(self, command: Command, what: int, value: int) -> bool:
         """Let the kernel repeat this effect whenever the line recurs."""
