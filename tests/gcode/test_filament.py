@@ -65,6 +65,9 @@ CASES = {
     "a climb behind a hop of the firmware": (
         "G1 Z.6\nM207 S1 F2400 Z.3\nG10\nG1 X60 Z.65 F1200\nG1 Y60 Z.6\nG11\nG1 X90 E2"
     ),
+    "a climb that begins behind a hop of the firmware": (
+        "G1 Z.6\nM207 S1 F2400 Z.3\nM400\nG10\nG1 X60 Z.65 F1200\nG1 Y60 Z.6\nG11\nG1 X90 E2"
+    ),
     "M220 is not for the extruder alone": "M220 S80\nG1 X60 E2.2\nG1 E-1\nG1 Y60 E1\nG1 E1\nM400",
 }
 START = "G28\nG90\nM83\nG1 X60 Y60 F6000\nG1 X90 E2.3\nG1 Y90 E2.1\n"
@@ -125,11 +128,18 @@ def test_retractions_far_from_zero_do_not_drift(decimals: int, cache: Path) -> N
     assert after == pytest.approx(before, abs=FILAMENT_MM)
 
 
-def check(text: str, kind: str, cache: Path, *, reverts: bool = True) -> bytes:
+@pytest.mark.parametrize("kind", ["marlin", "reprapfirmware"])
+def test_a_climb_behind_a_hop_in_what_is_left_out(kind: str, cache: Path) -> None:
+    text = START + "G1 Z.6\n;TYPE:Internal infill\nM207 S1 F2400 Z.3\nG1 X30 E2\n"
+    text += ";TYPE:External perimeter\nG10\nG1 X60 Z.65 F1200\nG1 Y60 Z.6 E2\nG11\nG1 X90 E2\n"
+    check(text, kind, cache, reverts=False, where="walls")
+
+
+def check(text: str, kind: str, cache: Path, *, reverts: bool = True, **options: object) -> bytes:
     """Every line finds the filament, place and modes of the original."""
     data, machine = tagged(text.encode()), machine_of(kind)
     with tempfile.TemporaryDirectory() as folder:
-        result, written = compensated(data, Path(folder), cache, machine)
+        result, written = compensated(data, Path(folder), cache, machine, **options)
     assert reverts or all("motor steps" in part.reason for part in result.put_back)
     assert differences(data, written, machine) == []
     return written
