@@ -19,14 +19,13 @@ from numpy.typing import NDArray
 from stillpath.gcode import _slots as at
 from stillpath.gcode._command_kernels import execute
 from stillpath.gcode._lex_kernels import PADDING, run
-from stillpath.gcode._motion_kernels import set_feed
 from stillpath.gcode.comments import note_comment
 from stillpath.gcode.dialect import Action, Dialect
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.dialects import dialect_of
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.lexer import Command, check_line_ends, further_words, odd_numbers, split_line
-from stillpath.gcode.meta import META_WORDS, held_back, meta_command
+from stillpath.gcode.meta import META_WORDS, expression_line, held_back, meta_command
 from stillpath.gcode.state import MachineState, nobody
 from stillpath.gcode.types import KEPT, EventKind, Events, Limits, ModalState, Moves, ProgramBlock
 from stillpath.models.machine import Machine
@@ -330,7 +329,7 @@ class Interpreter:
             name = f"G{motion}"
         word = dialect.word(name)
         if command.uncertain:
-            return self._uncertain(word, command)
+            return expression_line(state, word, command)
         if isinstance(word, Action):
             return self._classic(word, name, command)
         if isinstance(word, EventKind):
@@ -338,20 +337,6 @@ class Interpreter:
             state.remember(command, at.MEMO_EVENT, int(word))
             return state.event(word)
         return word(state, command)
-
-    def _uncertain(self, word: object, command: Command) -> int:
-        """Pass a line by whose values only the firmware can work out."""
-        state = self.state
-        if isinstance(word, EventKind) and word in (EventKind.HARMLESS, EventKind.STOP):
-            return state.event(word)
-        feed = command.words.get("F", "")
-        if isinstance(word, Action) and word <= Action.ARC_CCW and feed and "{" not in feed:
-            status = set_feed(state.f, state.i, state.number(feed, "F", command))
-            if status != at.OK:
-                return int(status)
-        state.warn("the line holds an expression; from here on the position is not known")
-        state.forget(origin=not isinstance(word, Action) or word >= Action.INCHES)
-        return state.event(EventKind.UNKNOWN)
 
     def _classic(self, action: Action, name: str, command: Command) -> int:
         """Execute a kernel command with numbers parsed in Python."""

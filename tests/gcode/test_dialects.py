@@ -447,6 +447,11 @@ def test_a_feedrate_outlasts_a_line_of_unknown_end(line: str, read) -> None:
     assert block.moves.speed_mm_s.tolist() == [10.0, 50.0, 50.0]
 
 
+def test_filament_of_a_line_of_unknown_end(read) -> None:
+    block, _ = read("M82\nG1 X{var.a} E5 F600\nG1 X1\nG1 X2 E6\n", "reprapfirmware")
+    assert (block.moves.end_mm - block.moves.start_mm)[:, 3].tolist() == [0.0, 1.0]
+
+
 def test_limits_of_kalico_are_reset(read) -> None:
     text = "SET_VELOCITY_LIMIT ACCEL=500\nG1 X1 F600\nRESET_VELOCITY_LIMIT\nG1 X2\n"
     block, _ = read(text, "klipper")
