@@ -372,8 +372,10 @@ def _finds_height(block: ProgramBlock) -> NDArray[np.bool_]:
     moves = block.moves
     known = (moves.known & 4) != 0
     found = ~known & np.append(known[1:], False)
-    if len(known) and not known[-1]:
-        found[-1] = b"Z" in block.line(moves, -1).split(b";", 1)[0].upper()
+    # What follows may not say: nothing, or G11, whose row knows no axis.
+    untold = ~known & ((moves.known & 3) == 3) & np.append((moves.known[1:] & 7) == 0, True)
+    for row in np.flatnonzero(untold).tolist():
+        found[row] = b"Z" in block.line(moves, row).split(b";", 1)[0].upper()
     return np.asarray(found)
 
 
