@@ -370,11 +370,8 @@ def _shifts_origin(line: bytes) -> bool:
 def _finds_height(block: ProgramBlock) -> NDArray[np.bool_]:
     """Mark moves whose lines name Z while it is only guessed: they may climb."""
     moves = block.moves
-    known = (moves.known & 4) != 0
-    found = ~known & np.append(known[1:], False)
-    # What follows may not say: nothing, or G11, whose row knows no axis.
-    untold = ~known & ((moves.known & 3) == 3) & np.append((moves.known[1:] & 7) == 0, True)
-    for row in np.flatnonzero(untold).tolist():
+    found = (moves.known & 7) == 3
+    for row in np.flatnonzero(found).tolist():
         found[row] = b"Z" in block.line(moves, row).split(b";", 1)[0].upper()
     return np.asarray(found)
 
