@@ -110,9 +110,6 @@ def _lines(piece: Piece, start: int, end: int, begin: int, until: int) -> Verbat
     ours = rows_of(events, rows)
     limits_before, modal_before = _state(piece, begin)
     limits_after, modal_after = _state(piece, until)
-    if int(moves.byte_start[start]) == begin:
-        # The row of a G10 with a hop does not have the origin behind it.
-        modal_before = piece.modal[int(moves.modal_id[start])]
     return VerbatimPart(
         moves=rows_of(moves, slice(start, end)),
         events=replace(ours, move_index=ours.move_index - start),

@@ -296,9 +296,6 @@ class Splitter:
         e = int(np.searchsorted(events.byte_start, until))
         limits, modal = self._tables
         limits_before, modal_before = limits[self._limits_id], modal[self._modal_id]
-        if m and not (e and events.byte_start[0] < moves.byte_start[0]):
-            # The row of a G10 with a hop does not have the origin behind it.
-            modal_before = modal[int(moves.modal_id[0])]
         last_move = int(moves.byte_start[m - 1]) if m else -1
         last_event = int(events.byte_start[e - 1]) if e else -1
         if max(last_move, last_event) >= 0:
