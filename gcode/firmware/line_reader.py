@@ -37,7 +37,7 @@ _FURTHER_MOVE = re.compile(rb"(?:^|[\s\d])G-?0*[0-35](?![\d.])", re.IGNORECASE)
 _E_WORD = re.compile(rb"E\s*([-+]?(?:\d+\.?\d*|\.\d+))")
 _E_WORD_FOLDED = re.compile(_E_WORD.pattern, re.IGNORECASE)
 _E_WORD_EXPONENT = re.compile(
-    rb"(?:(?<![\d.])|(?<=G\d)|(?<=G0\d))E\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:E[-+]?\d+)?)",
+    rb"(?:(?<![\d.])|(?<=G\d)|(?<=G0\d)|(?<=G92))E\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:E[-+]?\d+)?)",
     re.IGNORECASE,
 )
 """An E right after a digit belongs to the number before it, but not to the command."""
