@@ -101,7 +101,8 @@ class MachineState:
         self.workspace = 0 if dialect.expressions else -1
         facts = self.firmware.retraction
         self.retraction = None if facts is None else Retraction.of(facts)
-        self.retracted = False
+        self.retracted: dict[int, bool] = {}
+        """By tool; Klipper has one state for all."""
         self.hop_mm = 0.0
         self.factors: dict[str, float] = {}
         self.macro_ran = False

@@ -100,7 +100,7 @@ def set_retraction(state: MachineState, command: Command) -> int:
         if key in given:
             changed[field] = state.at_least(given[key], key, 1.0, command)
     state.change_retraction(**changed)
-    state.retracted = False
+    state.retracted.clear()
     return state.event(EventKind.MODE)
 
 
