@@ -10,6 +10,8 @@ from stillpath.gcode.types import EventKind, Limits
 
 __all__ = ["marked_text"]
 
+_LIMITS = (EventKind.LIMITS, EventKind.STATE)
+
 
 def marked_text(verbatim: VerbatimPart, commands: StreamCommands, marked: Limits | None) -> bytes:
     """Return the text of a part, with the mark set again behind lines that remove it.
@@ -22,7 +24,7 @@ def marked_text(verbatim: VerbatimPart, commands: StreamCommands, marked: Limits
     if marked is None:
         return verbatim.text
     events, parts, done = verbatim.events, [], 0
-    for row in np.flatnonzero(events.kind == EventKind.LIMITS).tolist():
+    for row in np.flatnonzero(np.isin(events.kind, _LIMITS)).tolist():
         line = verbatim.line(events, row)
         if not (line.endswith(b"\n") and commands.unmarks(line)):
             continue

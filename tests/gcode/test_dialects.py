@@ -203,6 +203,10 @@ CASES = {
     "blanks and subcodes": ("G  1 X5 F600\nG1.5 X6\n", same(FAMILY, 6, 0, 0, 0)),
     "G10 with a tool": ("G10 P0 S200\nG1 X1 F600\n", {"reprapfirmware": (1, 0, 0, 0)}),
     "modes saved": ("M120\nG91\nM121\nG1 X5 F600\nG1 X6\n", {"reprapfirmware": (6, 0, 0, 0)}),
+    "a plane saved": (
+        "M120\nG18\nM121\nG1 X10 F600\nG2 Y10 J5\n",
+        {"reprapfirmware": (10, 10, 0, 0)},
+    ),
     "CNC mode": ("M453\nG1 X5 (out) Y2 F600\nX7\n", {"reprapfirmware": (7, 2, 0, 0)}),
     "a command after quoted text": (
         'M117 "G1 X9" G1 X1 F600\nM117 G1 X9 "G1 X9"\n',

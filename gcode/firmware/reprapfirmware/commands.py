@@ -41,7 +41,7 @@ __all__ = [
     "tool",
 ]
 
-_MODES = (at.I_ABS_XYZ, at.I_ABS_E)
+_MODES = (at.I_ABS_XYZ, at.I_ABS_E, at.I_PLANE)
 _MOST_PUSHED = 10
 
 
@@ -273,7 +273,7 @@ def push_state(state: MachineState, command: Command) -> int:
 
 
 def pop_state(state: MachineState, _command: Command) -> int:
-    """M121: the modes, the units and F of the matching M120."""
+    """M121: the modes, the plane, the units and F of the matching M120."""
     depth = int(state.factors.get("pushed", 0.0)) - 1
     if depth < 0:
         state.warn("M121 without M120 is ignored")
