@@ -48,7 +48,7 @@ def expression_line(state: MachineState, word: Word, command: Command) -> int:
         if "E" in stated and ":" not in stated["E"]:
             _feed(state, state.number(stated["E"], "E", command))
     state.warn("the line holds an expression; from here on the position is not known")
-    state.forget(origin=not isinstance(word, Action) or word >= Action.INCHES)
+    state.forget(origin=_may_shift(word))
     return state.event(EventKind.UNKNOWN)
 
 
@@ -66,9 +66,18 @@ def held_back(state: MachineState, command: Command) -> int | None:
     word = state.dialect.word(command.name)
     if word == EventKind.HARMLESS:
         return state.event(EventKind.HARMLESS)
-    moves = isinstance(word, Action) and word <= Action.DWELL
-    state.forget(origin=not moves)
+    state.forget(origin=_may_shift(word))
     return state.event(EventKind.UNKNOWN)
+
+
+def _may_shift(word: Word) -> bool:
+    """Return whether coordinates may be read otherwise behind a command that may be executed.
+
+    A pause or a macro leaves modes and origin, as it does without a condition.
+    """
+    if isinstance(word, Action):
+        return word > Action.DWELL
+    return not isinstance(word, EventKind)
 
 
 def _feed(state: MachineState, e_value: float) -> None:

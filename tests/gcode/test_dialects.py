@@ -484,6 +484,10 @@ def test_meta_commands_are_barriers(read) -> None:
     unknown, harmless = EventKind.UNKNOWN, EventKind.HARMLESS
     assert block.events.kind.tolist() == [*3 * [unknown], *2 * [harmless], *2 * [unknown]]
     assert any("conditional" in text for text in interpreter.warnings)
+    # What a pause or a macro does, it does under a condition.
+    for text in ("if true\n  M25\n  M400\n", 'M98 P"a.g" A{var.a}\n'):
+        block, _ = read(f"{text}G1 X1 Y1 F600\nG1 X2\n", "reprapfirmware")
+        assert block.moves.known.tolist() == [0, 3]
     assert any("expression" in text for text in interpreter.warnings)
 
 
