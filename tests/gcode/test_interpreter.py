@@ -285,6 +285,15 @@ def test_klipper_stands_where_pressure_advance_averages_over_another_time(
     assert block.events.dwell_s[0] == pytest.approx(dwell_s or 0.0)
 
 
+def test_older_klippers_stand_at_every_pressure_advance(golden_machine: Machine) -> None:
+    told = {"stopping_macros": ("set_pressure_advance",)}
+    firmware = golden_machine.firmware.model_copy(update=told)
+    facts = {"firmware": firmware, "pressure_advance_s": 0.05}
+    block = run("SET_PRESSURE_ADVANCE ADVANCE=.07\n", golden_machine.model_copy(update=facts))
+    assert kinds(block) == [EventKind.STOP]
+    assert block.events.dwell_s[0] == pytest.approx(0.04)
+
+
 def test_macros_that_the_machine_declares(wary_machine: Machine) -> None:
     firmware = wary_machine.firmware.model_copy(
         update={
