@@ -176,6 +176,10 @@ CASES = {
         {"reprapfirmware": (12, 0, 2, 0)},
     ),
     "retraction and back": ("M83\nG1 X1 E1 F600\nG10\nG10\nG11\n", same(ALL, 1, 0, 0, 1)),
+    "a return that gives back less": (
+        "M83\nM207 S2 R-1.5\nG1 X1 E5 F600\nG10\nG11\n",
+        {"reprapfirmware": (1, 0, 0, 3.5)},
+    ),
     "retraction of each tool": (
         "M83\nT0\nG1 X1 E5 F600\nG10\nT1\nG10\nG11\nG11\n",
         {"klipper": (1, 0, 0, 5), **same(("marlin", "reprapfirmware"), 1, 0, 0, 4.2)},

@@ -197,7 +197,8 @@ def retract_settings(state: MachineState, command: Command) -> int:
     if "S" in given:
         changes["length_mm"] = max(given["S"], 0.0)
     if "R" in given:
-        changes["extra_mm"] = max(given["R"], -state.retraction.length_mm)
+        length_mm = changes.get("length_mm", state.retraction.length_mm)
+        changes["extra_mm"] = max(given["R"], -length_mm)
     if "F" in given:
         # One speed for both unless T follows; 60 mm/min is the least.
         changes["speed_mm_s"] = changes["return_speed_mm_s"] = max(given["F"], 60.0) / 60.0
