@@ -138,13 +138,11 @@ def _center(
 @kernel
 def _whole_turn(rule: int, angle: float, here: Any, there: Any, a: int, b: int) -> bool:
     """Return whether an arc that ends at its start is a full circle."""
-    if rule == _MARLIN_2_1:
+    if rule >= _MARLIN_2_1:  # RepRapFirmware compares 32-bit floats, offsets included
         return fabs(here[a] - there[a]) < _NEAR_MM and fabs(here[b] - there[b]) < _NEAR_MM
     if rule == _MARLIN_2_0:
         near = fabs(here[a] - there[a]) < _NEAR_MM and fabs(here[b] - there[b]) < _NEAR_MM
         return fabs(angle) < _NEAR_MM and near
-    if rule == _REPRAP:
-        return bool(here[a] == there[a] and here[b] == there[b])
     return bool(angle == 0.0 and here[a] == there[a] and here[b] == there[b])
 
 

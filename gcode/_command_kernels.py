@@ -171,6 +171,8 @@ def _set_position(w: Any, mask: int, f: Any, i: Any, rows: Any, tables: Any) -> 
             return ERROR_RANGE
         if rule == _POSITION and k < 3:
             f[F_LAST + k] = f[F_TOOL + k] = value + f[F_BASE + k]
+            if f[F_BASE + k] != 0.0:  # a workspace, which it passes over, or a hop
+                i[I_KNOWN] &= ~(1 << k)
             places = True
             continue
         f[F_BASE + k] = f[F_LAST + k] - value

@@ -60,7 +60,8 @@ def retract(state: MachineState, command: Command) -> int:
     if facts is None:
         return state.event(state.dialect.otherwise(command.name))
     retracting = command.name in ("G10", "M103")
-    if retracting == state.retracted:
+    tool = 0 if state.dialect.extended_commands else int(state.i[at.I_TOOL])
+    if retracting == state.retracted.get(tool, False):
         return state.event(EventKind.MODE)
     f = state.f
     scaled = state.dialect.retraction_scaled
@@ -92,7 +93,7 @@ def retract(state: MachineState, command: Command) -> int:
         state.hop_mm = max(0.0, state.hop_mm + hop)
         # A shifted origin of Z: the G-code's Z stays what it was.
         state.note_modal()
-    state.retracted = retracting
+    state.retracted[tool] = retracting
     return state.moved(status)
 
 
@@ -122,7 +123,8 @@ def tool(state: MachineState, command: Command) -> int:
     """T: another tool, or the one that is in use already."""
     digits = command.name[1:]
     if not digits.isdigit():
-        if not digits and state.dialect.expressions and not command.words:
+        reports = state.dialect.expressions and not command.words and "{" not in command.text
+        if not digits and reports:
             return state.event(EventKind.HARMLESS)  # T alone reports
         state.tool_known = False
         return state.event(EventKind.UNKNOWN)

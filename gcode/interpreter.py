@@ -25,7 +25,7 @@ from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.dialects import dialect_of
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.lexer import Command, check_line_ends, further_words, odd_numbers, split_line
-from stillpath.gcode.meta import META_WORDS, held_back, meta_command
+from stillpath.gcode.meta import META_WORDS, expression_line, held_back, meta_command
 from stillpath.gcode.state import MachineState, nobody
 from stillpath.gcode.types import KEPT, EventKind, Events, Limits, ModalState, Moves, ProgramBlock
 from stillpath.models.machine import Machine
@@ -329,7 +329,7 @@ class Interpreter:
             name = f"G{motion}"
         word = dialect.word(name)
         if command.uncertain:
-            return self._uncertain(word)
+            return expression_line(state, word, command)
         if isinstance(word, Action):
             return self._classic(word, name, command)
         if isinstance(word, EventKind):
@@ -337,15 +337,6 @@ class Interpreter:
             state.remember(command, at.MEMO_EVENT, int(word))
             return state.event(word)
         return word(state, command)
-
-    def _uncertain(self, word: object) -> int:
-        """Pass a line by whose values only the firmware can work out."""
-        state = self.state
-        if word == EventKind.HARMLESS:
-            return state.event(EventKind.HARMLESS)
-        state.warn("the line holds an expression; from here on the position is not known")
-        state.forget(origin=not isinstance(word, Action) or word >= Action.INCHES)
-        return state.event(EventKind.UNKNOWN)
 
     def _classic(self, action: Action, name: str, command: Command) -> int:
         """Execute a kernel command with numbers parsed in Python."""

@@ -1,4 +1,4 @@
-"""RepRapFirmware's meta commands, whose decisions are unknown before the print.
+"""RepRapFirmware's meta commands and expressions, whose results are unknown before the print.
 
 Lines of a block after ``if`` or ``while`` may be executed once, often or never. Those that do not
 touch the motion are read as usual; any other remains a barrier after which the place is unknown.
@@ -8,12 +8,13 @@ Source: RepRapFirmware src/GCodes/GCodeBuffer/StringParser.cpp, 3.5.
 from __future__ import annotations
 
 from stillpath.gcode import _slots as at
-from stillpath.gcode.dialect import Action
+from stillpath.gcode._motion_kernels import set_feed
+from stillpath.gcode.dialect import Action, Word
 from stillpath.gcode.lexer import Command
 from stillpath.gcode.state import MachineState
 from stillpath.gcode.types import EventKind
 
-__all__ = ["META_WORDS", "held_back", "meta_command"]
+__all__ = ["META_WORDS", "expression_line", "held_back", "meta_command"]
 
 _OPENING = ("if", "elif", "else", "while")
 _HARMLESS = ("var", "global", "set", "echo", "skip")
@@ -34,6 +35,23 @@ def meta_command(state: MachineState, command: Command) -> int:
     return state.event(EventKind.UNKNOWN)
 
 
+def expression_line(state: MachineState, word: Word, command: Command) -> int:
+    """Pass a line by whose values only the firmware can work out; a move's own E and F count."""
+    if isinstance(word, EventKind) and word in (EventKind.HARMLESS, EventKind.STOP):
+        return state.event(word)
+    if isinstance(word, Action) and word <= Action.ARC_CCW:
+        stated = {k: v for k, v in command.words.items() if k in "EF" and v and v[0] not in "{:"}
+        if "F" in stated:
+            status = set_feed(state.f, state.i, state.number(stated["F"], "F", command))
+            if status != at.OK:
+                return int(status)
+        if "E" in stated and ":" not in stated["E"]:
+            _feed(state, state.number(stated["E"], "E", command))
+    state.warn("the line holds an expression; from here on the position is not known")
+    state.forget(origin=_may_shift(word))
+    return state.event(EventKind.UNKNOWN)
+
+
 def held_back(state: MachineState, command: Command) -> int | None:
     """Handle a line of a conditional block; None: the block has ended or there is none."""
     if state.conditional_indent < 0:
@@ -48,9 +66,27 @@ def held_back(state: MachineState, command: Command) -> int | None:
     word = state.dialect.word(command.name)
     if word == EventKind.HARMLESS:
         return state.event(EventKind.HARMLESS)
-    moves = isinstance(word, Action) and word <= Action.DWELL
-    state.forget(origin=not moves)
+    state.forget(origin=_may_shift(word))
     return state.event(EventKind.UNKNOWN)
+
+
+def _may_shift(word: Word) -> bool:
+    """Return whether coordinates may be read otherwise behind a command that may be executed.
+
+    A pause or a macro leaves modes and origin, as it does without a condition.
+    """
+    if isinstance(word, Action):
+        return word > Action.DWELL
+    return not isinstance(word, EventKind)
+
+
+def _feed(state: MachineState, e_value: float) -> None:
+    """Set the extruder to the E of a line that is not followed as a move."""
+    f = state.f
+    state.settle()
+    length_mm = e_value * f[at.F_UNIT_E_MM] * f[at.F_EXTRUDE_FACTOR]
+    f[at.F_LAST + 3] = length_mm + f[at.F_BASE + 3 if state.i[at.I_ABS_E] else at.F_LAST + 3]
+    f[at.F_TOOL + 3] = f[at.F_LAST + 3]
 
 
 def _indent(text: str) -> int:

@@ -73,7 +73,10 @@ class Piece(VerbatimPart):
     @classmethod
     def planned(cls, lines: VerbatimPart, phases: Phases) -> Piece:
         """Return the lines of a verbatim part with the plan of its moves."""
-        return cls(**{f.name: getattr(lines, f.name) for f in fields(lines)}, phases=phases)
+        columns = {f.name: getattr(lines, f.name) for f in fields(lines)}
+        # The row of a G10 before it does not have the origin that its hop leaves.
+        columns["modal_before"] = lines.modal[int(lines.moves.modal_id[0])]
+        return cls(**columns, phases=phases)
 
     @property
     def after_mark(self) -> bool:

@@ -367,10 +367,9 @@ def _shifts_origin(line: bytes) -> bool:
 def _finds_height(block: ProgramBlock) -> NDArray[np.bool_]:
     """Mark moves whose lines name Z while it is only guessed: they may climb."""
     moves = block.moves
-    known = (moves.known & 4) != 0
-    found = ~known & np.append(known[1:], False)
-    if len(known) and not known[-1]:
-        found[-1] = b"Z" in block.line(moves, -1).split(b";", 1)[0].upper()
+    found = (moves.known & 7) == 3
+    for row in np.flatnonzero(found).tolist():
+        found[row] = b"Z" in block.line(moves, row).split(b";", 1)[0].upper()
     return np.asarray(found)
 
 

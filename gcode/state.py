@@ -101,7 +101,8 @@ class MachineState:
         self.workspace = 0 if dialect.expressions else -1
         facts = self.firmware.retraction
         self.retraction = None if facts is None else Retraction.of(facts)
-        self.retracted = False
+        self.retracted: dict[int, bool] = {}
+        """By tool; Klipper has one state for all."""
         self.hop_mm = 0.0
         self.factors: dict[str, float] = {}
         self.macro_ran = False
@@ -209,8 +210,8 @@ class MachineState:
                 if home_mm is not None:
                     f[at.F_LAST + k] = f[at.F_TOOL + k] = home_mm[k]
         i[at.I_ORIGIN_KNOWN] |= axes
-        # Homing an axis may move the others too (safe_z_home).
-        i[at.I_KNOWN] = 0 if home_mm is None else i[at.I_KNOWN] | axes
+        # Homing an axis may move the others too (safe_z_home, homex.g).
+        i[at.I_KNOWN] = 0 if home_mm is None else axes
         self.settle()
         self.note_modal()
 
@@ -245,7 +246,7 @@ class MachineState:
         for name, value in values.items():
             row[self.limits_names.index(name)] = value
         limits = self.f[at.F_LIMITS : at.F_LIMITS + len(row)]
-        remember = remember and self.f[at.F_UNIT_MM] == 1.0
+        remember = remember and kind == EventKind.LIMITS and self.f[at.F_UNIT_MM] == 1.0
         if remember and self.memo_limits < len(self.tables.memo_limits):
             self.tables.memo_limits[self.memo_limits] = row
             if self.remember(command, at.MEMO_LIMITS, self.memo_limits):
@@ -253,6 +254,13 @@ class MachineState:
         limits[:] = np.where(np.isnan(row), limits, row)
         note_limits(self.f, self.i, self.rows, self.tables)
         return self.event(kind)
+
+    def limits_kind(self, command: Command, letters: str) -> EventKind:
+        """Return the effect of a line of limits, of which a stream holds back those of `letters`.
+
+        Its further words (another axis) would be lost with it.
+        """
+        return EventKind.STATE if command.words.keys() - set(letters) else EventKind.LIMITS
 
     def remember(self, command: Command, what: int, value: int) -> bool:
         """Let the kernel repeat this effect whenever the line recurs."""

@@ -57,10 +57,10 @@ def machine_space(state: MachineState, command: Command) -> int:
         return state.event(EventKind.MODE)
     before, shift = state.workspace, _shift(state)
     moves = int(state.i[at.I_MOVES])
-    _set_shift(state, _NONE)
+    # In Marlin, what G92 has shifted in native space stays.
+    _set_shift(state, _NONE if before != native else shift)
     status = state.carry_out(rest[0])
-    if before >= 0 or state.dialect.expressions:
-        _set_shift(state, shift)
+    _set_shift(state, shift)
     # The line does more than move, and must stay.
     state.settle()
     state.rows.tiny[at.M_KNOWN, moves : int(state.i[at.I_MOVES])] &= KEPT

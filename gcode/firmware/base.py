@@ -121,6 +121,10 @@ class StreamCommands(Protocol):
         """A line has only one command (RepRapFirmware allows several)."""
 
     @property
+    def first_wins(self) -> bool:
+        """Of repeated words the first counts, and numbers may have exponents (RepRapFirmware)."""
+
+    @property
     def ignores_subcodes(self) -> bool:
         """G1.5 is a G1 (Marlin)."""
 
@@ -139,6 +143,10 @@ class StreamCommands(Protocol):
     @property
     def coarse_extruder(self) -> bool:
         """Relative E is summed in 32-bit floats, so small moves far from 0 lose digits (Marlin)."""
+
+    @property
+    def relative_moves_count(self) -> bool:
+        """Absolute E goes on from where relative moves have ended (not in RepRapFirmware)."""
 
     @property
     def shaper_off(self) -> bytes:

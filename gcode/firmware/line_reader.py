@@ -36,6 +36,11 @@ _MOVE_WITH_SUBCODE = re.compile(rb"^\s*(?:N\d+\s*)?G-?0*[0-35]\.\d", re.IGNORECA
 _FURTHER_MOVE = re.compile(rb"(?:^|[\s\d])G-?0*[0-35](?![\d.])", re.IGNORECASE)
 _E_WORD = re.compile(rb"E\s*([-+]?(?:\d+\.?\d*|\.\d+))")
 _E_WORD_FOLDED = re.compile(_E_WORD.pattern, re.IGNORECASE)
+_E_WORD_EXPONENT = re.compile(
+    rb"(?:(?<![\d.])|(?<=G\d)|(?<=G0\d)|(?<=G92))E\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:E[-+]?\d+)?)",
+    re.IGNORECASE,
+)
+"""An E right after a digit belongs to the number before it, but not to the command."""
 
 
 class LineReader:
@@ -44,6 +49,8 @@ class LineReader:
     def __init__(self, commands: StreamCommands) -> None:
         self._commands = commands
         self._e_word = _E_WORD_FOLDED if commands.folds_case else _E_WORD
+        if commands.first_wins:
+            self._e_word = _E_WORD_EXPONENT
 
     def is_move(self, code: bytes) -> bool:
         """Return whether a line holds a G0 to G3 or G5, or their words alone."""
@@ -52,6 +59,6 @@ class LineReader:
         return bool(_MOVE.match(code) or further or subcode)
 
     def extruder_word(self, code: bytes) -> float | None:
-        """Return the E of a line; of several the last, as Marlin does, which alone needs it."""
+        """Return the E of a line, as the firmware reads it."""
         found = self._e_word.findall(code)
-        return float(found[-1]) if found else None
+        return float(found[0 if self._commands.first_wins else -1]) if found else None

@@ -18,6 +18,8 @@ __all__ = ["ends_at_mark", "file_text"]
 Inserted = Iterator[tuple[int, bytes]]
 """Places in the bytes of a part, and the lines that come there."""
 
+_LIMITS = (EventKind.LIMITS, EventKind.STATE)
+
 
 def file_text(
     verbatim: VerbatimPart,
@@ -57,7 +59,7 @@ def ends_at_mark(verbatim: VerbatimPart) -> bool:
 def _mark_lines(verbatim: VerbatimPart, commands: StreamCommands) -> Inserted:
     """Yield the limits with the mark of a stream, behind the file's lines that remove it."""
     events = verbatim.events
-    for row in np.flatnonzero(events.kind == EventKind.LIMITS).tolist():
+    for row in np.flatnonzero(np.isin(events.kind, _LIMITS)).tolist():
         line = verbatim.line(events, row)
         if line.endswith(b"\n") and commands.unmarks(line):
             own = verbatim.limits[int(events.limits_id[row])]

@@ -30,7 +30,7 @@ from stillpath.gcode.firmware.line_reader import (
     LineReader,
 )
 from stillpath.gcode.firmware.marking import ends_at_mark, file_text
-from stillpath.gcode.firmware.modes import WrittenModes, feed_line, written_modes
+from stillpath.gcode.firmware.modes import WrittenModes, event_places, feed_line, written_modes
 from stillpath.gcode.firmware.planning import stops
 from stillpath.gcode.pieces import LeftOut, Piece, VerbatimPart
 from stillpath.gcode.types import EventKind, Limits, ModalState
@@ -76,6 +76,8 @@ class StreamWriter:
         """The printer's E, if it must be set to 0 before a stream continues."""
         self._zero_mm = 0.0
         """The file's E where the printer's reads 0."""
+        self._absolute_e = self._uncounted = False
+        """The piece has absolute E; the printer's E may not count what our lines have fed."""
         self._file_feed_mm_min = 0.0
         self._behind: tuple[Limits, ModalState] | None = None
         """What the file had set after the last piece."""
@@ -162,11 +164,13 @@ class StreamWriter:
     def piece(self, piece: Piece, encoded: Encoded, extruder_mm: float) -> bytes:
         """Return the text of a compensated piece; `extruder_mm` as in `verbatim`."""
         self._reads(extruder_mm)
+        used = np.unique(piece.moves.modal_id).tolist()
+        self._absolute_e = any(piece.modal[k].absolute_e for k in used)
         limits, level = encoded.limits, encoded.level
         parts = [self._on(piece, limits[level[0]], extruder_mm)]
         rows, events = encoded.row, piece.events
-        index = self._event_places(piece, encoded)
-        modes = written_modes(piece, index)
+        index = event_places(piece, encoded)
+        modes = written_modes(piece, encoded, index)
         text, line_end, extruded = self._format(encoded, modes, index, events.kind)
 
         kinds = events.kind.tolist()
@@ -202,25 +206,6 @@ class StreamWriter:
         self._at_rest = self._behind_mark = False
         self._behind = (piece.limits_after, piece.modal_after)
         return b"".join(parts)
-
-    def _event_places(self, piece: Piece, encoded: Encoded) -> NDArray[np.int64]:
-        """Return the index of the written move before which each event is written."""
-        first = np.full(len(piece.moves) + 1, len(encoded.row), np.int64)
-        # The move that begins nearest to the moment; the encoder's times are slightly off the plan.
-        between_s = 0.5 * (encoded.start_s[1:] + encoded.start_s[:-1])
-        first[:-1] = np.searchsorted(between_s, encoded.row_start_s - 1e-6)
-        rest = encoded.row >= 0
-        rows, places = encoded.row[rest], np.flatnonzero(rest)
-        # What the file says at rest comes before a shaper begins to move, ahead of the plan.
-        first[rows + 1] = places + 1
-        # An event never moves across a rest, in either direction, not even across one that takes no
-        # time or follows a stretch without written moves.
-        first[rows] = places
-        first = np.maximum.accumulate(first)
-        until = np.full(len(first), len(encoded.row))
-        until[rows] = places
-        first = np.minimum(first, np.minimum.accumulate(until[::-1])[::-1])
-        return first[np.minimum(piece.events.move_index, len(piece.moves))]
 
     def _format(
         self,
@@ -290,15 +275,15 @@ class StreamWriter:
         moves_on = self._lines.is_move(code)
         # Not G10 and G11, whatever words they have: they do not change E.
         ends = self._lines.extruder_word(code) if state.absolute_e and moves_on else None
+        alone = self._stream_commands.factors_need_axes and not AXES.search(code)
         if ends is not None:
-            fed = (float(moves.end_mm[row, 3]) - extruded_mm) / state.extrude_factor
-            lead += self._file_extruder(ends - fed)
+            fed = float(moves.end_mm[row, 3]) - extruded_mm
+            lead += self._file_extruder(ends - fed / (1.0 if alone else state.extrude_factor))
             self._reads(ends)
         elif self._far_mm is not None and moves_on:
             fed = float(moves.end_mm[row, 3] - moves.start_mm[row, 3])
             self._reads(self._far_mm + fed / state.extrude_factor)
         if moves_on and not FEED.search(code):
-            alone = self._stream_commands.factors_need_axes and not AXES.search(code)
             factor = 1.0 if alone else state.speed_factor
             lead += feed_line(float(moves.speed_mm_s[row]) * 60.0 / factor)
         return lead + line
@@ -313,6 +298,7 @@ class StreamWriter:
         """Return lines that set the stream's limits and modes."""
         text = self._limits_to(limits) + self._file_modes(modes)
         self._modal = modes
+        self._uncounted |= self._absolute_e and not self._stream_commands.relative_moves_count
         if self._far_mm is not None:
             self._zero_mm += self._far_mm
             self._far_mm = None
@@ -332,15 +318,15 @@ class StreamWriter:
         if value_mm is None:
             return b""
         reads_mm = value_mm + ahead_mm
-        self._zero_mm = 0.0
+        self._zero_mm, self._uncounted = 0.0, False
         self._reads(reads_mm)
         return b"" if abs(ahead_mm) < _LEAST_GAP_MM else f"G92 E{reads_mm:.7f}\n".encode()
 
     def _file_extruder(self, file_mm: float) -> bytes:
         """Return the line that sets the printer's E to the file's."""
-        if self._zero_mm == 0.0:
+        if self._zero_mm == 0.0 and not self._uncounted:
             return b""
-        self._zero_mm = 0.0
+        self._zero_mm, self._uncounted = 0.0, False
         return f"G92 E{file_mm:.7f}\n".encode()
 
     def _file_modes(self, state: ModalState) -> bytes:

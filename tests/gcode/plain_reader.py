@@ -64,8 +64,10 @@ def is_motion(line: bytes) -> bool:
     return re.search(rb"[XYZEIJR]", found[3]) is not None
 
 
-def read(data: bytes, firmware: Firmware = "klipper") -> Reading:
-    """Read a whole file."""
+def read(
+    data: bytes, firmware: Firmware = "klipper", *, relative_moves_count: bool = True
+) -> Reading:
+    """Read a whole file; of RepRapFirmware, most versions do not count relative moves."""
     out = Reading()
     place, offset = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
     named = [False, False, False]
@@ -92,7 +94,7 @@ def read(data: bytes, firmware: Firmware = "klipper") -> Reading:
                 relative = not out.absolute_e or (firmware == "klipper" and not out.absolute_xyz)
                 fed = words[b"E"] - (0.0 if relative else register)
                 # An absolute register counts in the file's own millimetres.
-                register += fed
+                register += fed if relative_moves_count or not relative else 0.0
                 out.extruded_mm[out.tool] += fed * out.flow_percent / 100.0
             if place != before:
                 out.moves += 1

@@ -150,6 +150,15 @@ CASES = {
         "G54\nG1 X1 F600\nG92 X0\nG1 X1\nG55\nG1 X1\nG54\nG1 X2\nG53 G1 X4\nG1 X5\n",
         same(LARGE, 6, 0, 0, 0),
     ),
+    "G53 where G92 has shifted native space": (
+        "G1 X5 F600\nG92 X0\nG53 G1 X4\nG1 X5\n",
+        same(LARGE, 10, 0, 0, 0),
+    ),
+    "the workspace in use": ("G10 L2 P0 X10\nG1 X1 F600\n", {"reprapfirmware": (11, 0, 0, 0)}),
+    "full circle in a workspace": (
+        "G10 L2 P1 X3 Y2\nM83\nG1 X126.194 Y87.576 F600\nG3 X126.194 Y87.576 I.5 E2\n",
+        {"reprapfirmware": (129.194, 89.576, 0, 2)},
+    ),
     "workspaces of RepRapFirmware": (
         "G10 L2 P2 X10\nG55\nG1 X1 F600\nG53 G1 X3\nG1 X2\n",
         {"reprapfirmware": (12, 0, 0, 0)},
@@ -167,6 +176,14 @@ CASES = {
         {"reprapfirmware": (12, 0, 2, 0)},
     ),
     "retraction and back": ("M83\nG1 X1 E1 F600\nG10\nG10\nG11\n", same(ALL, 1, 0, 0, 1)),
+    "a return that gives back less": (
+        "M83\nM207 S2 R-1.5\nG1 X1 E5 F600\nG10\nG11\n",
+        {"reprapfirmware": (1, 0, 0, 3.5)},
+    ),
+    "retraction of each tool": (
+        "M83\nT0\nG1 X1 E5 F600\nG10\nT1\nG10\nG11\nG11\n",
+        {"klipper": (1, 0, 0, 5), **same(("marlin", "reprapfirmware"), 1, 0, 0, 4.2)},
+    ),
     "volumetric": (
         f"M83\nM200 D2\nG1 X1 E{math.pi} F600\n",
         same((*FAMILY, "reprapfirmware"), 1, 0, 0, 1),
@@ -190,6 +207,10 @@ CASES = {
     "blanks and subcodes": ("G  1 X5 F600\nG1.5 X6\n", same(FAMILY, 6, 0, 0, 0)),
     "G10 with a tool": ("G10 P0 S200\nG1 X1 F600\n", {"reprapfirmware": (1, 0, 0, 0)}),
     "modes saved": ("M120\nG91\nM121\nG1 X5 F600\nG1 X6\n", {"reprapfirmware": (6, 0, 0, 0)}),
+    "a plane saved": (
+        "M120\nG18\nM121\nG1 X10 F600\nG2 Y10 J5\n",
+        {"reprapfirmware": (10, 10, 0, 0)},
+    ),
     "CNC mode": ("M453\nG1 X5 (out) Y2 F600\nX7\n", {"reprapfirmware": (7, 2, 0, 0)}),
     "a command after quoted text": (
         'M117 "G1 X9" G1 X1 F600\nM117 G1 X9 "G1 X9"\n',
@@ -390,12 +411,22 @@ CLASSES = {
     **{line: {"marlin-stock": EventKind.HARMLESS} for line in ("G17", "G80", "g1 X5")},
     **{
         line: {"reprapfirmware": EventKind.UNKNOWN}
-        for line in ("T-1", "T R1", "M109 S200", "M24", "G10 L1 P0 X1", "M28 a.g")
+        for line in ("T-1", "T R1", "T{1}", "M109 S200", "M24", "G10 L1 P0 X1", "M28 a.g")
     },
     **{
         line: {"reprapfirmware": EventKind.STOP}
-        for line in ("M17", "M906 X800", "M913 X50", "G17", "M302 P1", "M92 X80")
+        for line in (
+            *("M17", "M906 X800", "M913 X50", "G17", "M302 P1", "M92 X80", "M190 S{var.bed}"),
+            *("G10 L2 P1 X5", "G10 L20 Z0"),
+        )
     },
+    "G10 L20 P2": {"reprapfirmware": EventKind.HARMLESS},
+    # Held back in a stream, a further word would be lost.
+    "M201 X500": dict.fromkeys(("marlin", "reprapfirmware"), EventKind.LIMITS),
+    "M201 X500 F50": {"marlin": EventKind.STATE},
+    "M566 X300 U300": {"reprapfirmware": EventKind.STATE},
+    "SET_VELOCITY_LIMIT ACCEL=500 ACCEL_TO_DECEL=200": {"klipper": EventKind.LIMITS},
+    "SET_VELOCITY_LIMIT ACCEL=500 Z_ACCEL=100": {"klipper": EventKind.STATE},
     # OctoPrint's, and its plugins'.
     **{line: dict.fromkeys(ALL, EventKind.UNKNOWN) for line in ("@pause", "N5 @OCTOLAPSE TAKE")},
     "@Objectinfo a X1 Y2": dict.fromkeys(ALL, EventKind.HARMLESS),
@@ -417,6 +448,27 @@ def test_a_place_that_is_told_is_no_motion(read) -> None:
     assert block.events.kind[-1] == EventKind.UNKNOWN
     assert block.moves.known.tolist() == [7, 7]
     assert block.moves.start_mm[1, 0] == 50.0
+    # It passes over workspaces (GCodes3.cpp, SetPositions).
+    block, _ = read("G10 L2 P1 X3\nG1 X10 F600\nG92 X50\nG1 X51\nG1 X52\n", "reprapfirmware")
+    assert block.moves.known.tolist() == [7, 6, 7]
+
+
+@pytest.mark.parametrize("line", ["G1 X{var.a} F3000", "G1 H1 X-300 F3000", "G1 R1 X0 F3000"])
+def test_a_feedrate_outlasts_a_line_of_unknown_end(line: str, read) -> None:
+    block, _ = read(f"G1 X1 F600\n{line}\nG1 X2\nG1 X3\n", "reprapfirmware")
+    assert block.moves.speed_mm_s.tolist() == [10.0, 50.0, 50.0]
+
+
+def test_filament_of_a_line_of_unknown_end(read) -> None:
+    block, _ = read("M82\nG1 X{var.a} E5 F600\nG1 X1\nG1 X2 E6\n", "reprapfirmware")
+    assert (block.moves.end_mm - block.moves.start_mm)[:, 3].tolist() == [0.0, 1.0]
+
+
+def test_limits_of_kalico_are_reset(read) -> None:
+    text = "SET_VELOCITY_LIMIT ACCEL=500\nG1 X1 F600\nRESET_VELOCITY_LIMIT\nG1 X2\n"
+    block, _ = read(text, "klipper")
+    accels = [block.limits[k].accel_mm_s2 for k in block.moves.limits_id]
+    assert accels == [500.0, FIRMWARES["klipper"].planner.max_accel_mm_s2]
 
 
 @pytest.mark.parametrize("line", CLASSES)
@@ -436,6 +488,10 @@ def test_meta_commands_are_barriers(read) -> None:
     unknown, harmless = EventKind.UNKNOWN, EventKind.HARMLESS
     assert block.events.kind.tolist() == [*3 * [unknown], *2 * [harmless], *2 * [unknown]]
     assert any("conditional" in text for text in interpreter.warnings)
+    # What a pause or a macro does, it does under a condition.
+    for text in ("if true\n  M25\n  M400\n", 'M98 P"a.g" A{var.a}\n'):
+        block, _ = read(f"{text}G1 X1 Y1 F600\nG1 X2\n", "reprapfirmware")
+        assert block.moves.known.tolist() == [0, 3]
     assert any("expression" in text for text in interpreter.warnings)
 
 

@@ -62,6 +62,12 @@ CASES = {
         "M221 S80\nM83\nG1 X60 E1\nG1 E1\nG1 Y60 E.5\nM82\nG1 X90 E0 F3000\nG1 Y80 E3\n"
         "M400\nG1 Y60 E4"
     ),
+    "a climb behind a hop of the firmware": (
+        "G1 Z.6\nM207 S1 F2400 Z.3\nG10\nG1 X60 Z.65 F1200\nG1 Y60 Z.6\nG11\nG1 X90 E2"
+    ),
+    "a climb that begins behind a hop of the firmware": (
+        "G1 Z.6\nM207 S1 F2400 Z.3\nM400\nG10\nG1 X60 Z.65 F1200\nG1 Y60 Z.6\nG11\nG1 X90 E2"
+    ),
     "M220 is not for the extruder alone": "M220 S80\nG1 X60 E2.2\nG1 E-1\nG1 Y60 E1\nG1 E1\nM400",
 }
 START = "G28\nG90\nM83\nG1 X60 Y60 F6000\nG1 X90 E2.3\nG1 Y90 E2.1\n"
@@ -88,6 +94,23 @@ def test_filament_of_any_print(kind: str, cache: Path, steps: list[tuple]) -> No
         assert after[tool] == pytest.approx(before[tool], abs=FILAMENT_MM)
 
 
+@pytest.mark.parametrize("change", ["M221 S80", "G92 E40", "G10\nG11", "G1 E2e0 F900\nG1E1.7"])
+def test_absolute_e_of_reprapfirmware(change: str, cache: Path) -> None:
+    """Most of its versions go on from the last absolute E, whatever a stream has fed since."""
+    e = 40.0 if "G92" in change else 1.7
+    text = START.replace("M83", "M82\nG92 E0").replace("E2.1", "E3.1")
+    text += f"G1 E1.7 F2100\nG1 Z.6\n{change}\nG1 X60 F6000\nG1 E{e + 1.4} F2100\nG1 Y60 E{e + 3}\n"
+    text += f"M400\nG1 X90 E{e + 4}\nG1 E{e + 3} F2100\nM83\nG1 Y90 E1\nM400\nG1 E-1\n"
+    written = check(text, "reprapfirmware", cache, reverts=False)
+    assert b"M83" in written
+    for how in (False, True):
+        before, after = (
+            read(data, "reprapfirmware", relative_moves_count=how).extruded_mm[0]
+            for data in (text.encode(), written)
+        )
+        assert after == pytest.approx(before, abs=FILAMENT_MM)
+
+
 @pytest.mark.parametrize("decimals", [5, 7])
 def test_retractions_far_from_zero_do_not_drift(decimals: int, cache: Path) -> None:
     """What Marlin's E is set back to has the digits of the file."""
@@ -105,11 +128,18 @@ def test_retractions_far_from_zero_do_not_drift(decimals: int, cache: Path) -> N
     assert after == pytest.approx(before, abs=FILAMENT_MM)
 
 
-def check(text: str, kind: str, cache: Path, *, reverts: bool = True) -> bytes:
+@pytest.mark.parametrize("kind", ["marlin", "reprapfirmware"])
+def test_a_climb_behind_a_hop_in_what_is_left_out(kind: str, cache: Path) -> None:
+    text = START + "G1 Z.6\n;TYPE:Internal infill\nM207 S1 F2400 Z.3\nG1 X30 E2\n"
+    text += ";TYPE:External perimeter\nG10\nG1 X60 Z.65 F1200\nG1 Y60 Z.6 E2\nG11\nG1 X90 E2\n"
+    check(text, kind, cache, reverts=False, where="walls")
+
+
+def check(text: str, kind: str, cache: Path, *, reverts: bool = True, **options: object) -> bytes:
     """Every line finds the filament, place and modes of the original."""
     data, machine = tagged(text.encode()), machine_of(kind)
     with tempfile.TemporaryDirectory() as folder:
-        result, written = compensated(data, Path(folder), cache, machine)
+        result, written = compensated(data, Path(folder), cache, machine, **options)
     assert reverts or all("motor steps" in part.reason for part in result.put_back)
     assert differences(data, written, machine) == []
     return written

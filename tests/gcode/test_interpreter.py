@@ -190,6 +190,11 @@ def test_known_axes(wary_machine: Machine) -> None:
     )
     assert block.moves.known.tolist() == [0, 1, 3, 0, 0, 1, 0]
     assert kinds(block)[:2] == [EventKind.UNKNOWN, EventKind.UNKNOWN]
+    # A probe is taken to the middle of the bed; macros of X and Y lift Z.
+    facts = {"firmware": wary_machine.firmware.model_copy(update={"home_mm": (0.0, 0.0, 0.0)})}
+    homed = wary_machine.model_copy(update=facts)
+    block = run("G28\nG1 X5\nG28 Z\nG1 X6\nG1 X7 Y7\nG28 X\nG1 X1\nG1 Y1\nG1 Z1\n", homed)
+    assert block.moves.known.tolist() == [7, 4, 5, 1, 1, 3]
     # A named axis whose place we do not know may move, though we guess it stands there.
     assert kinds(run("G28\nG1 X0\nG1 X0\n", wary_machine))[1:] == [
         EventKind.UNKNOWN,
@@ -278,6 +283,15 @@ def test_klipper_stands_where_pressure_advance_averages_over_another_time(
     stop, harmless = EventKind.STOP, EventKind.HARMLESS
     assert kinds(block) == [harmless if dwell_s is None else stop, stop if again else harmless]
     assert block.events.dwell_s[0] == pytest.approx(dwell_s or 0.0)
+
+
+def test_older_klippers_stand_at_every_pressure_advance(golden_machine: Machine) -> None:
+    told = {"stopping_macros": ("set_pressure_advance",)}
+    firmware = golden_machine.firmware.model_copy(update=told)
+    facts = {"firmware": firmware, "pressure_advance_s": 0.05}
+    block = run("SET_PRESSURE_ADVANCE ADVANCE=.07\n", golden_machine.model_copy(update=facts))
+    assert kinds(block) == [EventKind.STOP]
+    assert block.events.dwell_s[0] == pytest.approx(0.04)
 
 
 def test_macros_that_the_machine_declares(wary_machine: Machine) -> None:

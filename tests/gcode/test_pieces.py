@@ -410,9 +410,18 @@ def test_a_wild_extruder_leaves_as_it_came(machine: Machine, fed: float, ours: b
 
 
 @pytest.mark.parametrize("chunk", [1, 1 << 17])
-def test_a_line_that_finds_the_height_stays(machine: Machine, chunk: int) -> None:
-    """Z is guessed at 0: after a start macro that left it elsewhere this line moves it."""
-    text = b"G1 X104 Y100 F3000\nG1 Y189 E3\nG1 X107 Z0 E1\nG1 X90 E1\nG1 Y100 E1\n"
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"G1 X104 Y100 F3000\nG1 Y189 E3\nG1 X107 Z0 E1\n",
+        b"G1 X104 Y100 F3000\nG10\nG1 Y189 E3\nG1 X107 Z0 E1\nG11\n",
+        # In coordinates of the file's own the machine's Z is never known.
+        b"G92 Z0\nPAUSE\nG1 X104 Y100 F3000\nG1 Y189 E3\nG1 X107 Z0 E1\n",
+    ],
+)
+def test_a_line_that_finds_the_height_stays(machine: Machine, chunk: int, text: bytes) -> None:
+    """Z is guessed at 0: after a macro that left it elsewhere this line moves it."""
+    text += b"G1 X90 E1\nG1 Y100 E1\n"
     pieces = [x.text for x in cut(text, machine, chunk=chunk) if isinstance(x, Piece)]
     assert b"".join(pieces).count(b"E") == 3
     assert not any(b"Z0" in piece for piece in pieces)

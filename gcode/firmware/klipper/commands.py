@@ -20,6 +20,7 @@ __all__ = [
     "activate_extruder",
     "exclude_object",
     "gcode_offset",
+    "reset_velocity_limit",
     "restore_state",
     "save_state",
     "set_retraction",
@@ -57,7 +58,20 @@ def velocity_limit(state: MachineState, command: Command) -> int:
             "short moves have other speeds; let the slicer write MINIMUM_CRUISE_RATIO, or update "
             "Klipper"
         )
-    return state.set_limits(command, values)
+    # Kalico has further ones, of Z; held back in a stream they would be lost.
+    further = given.keys() - {*_LIMITS, "ACCEL_TO_DECEL"}
+    kind = EventKind.STATE if further else EventKind.LIMITS
+    return state.set_limits(command, values, kind=kind)
+
+
+def reset_velocity_limit(state: MachineState, _command: Command) -> int:
+    """RESET_VELOCITY_LIMIT of Kalico, or a macro: the limits of printer.cfg."""
+    state.settle()
+    row = state.initial_limits
+    state.f[at.F_LIMITS : at.F_LIMITS + len(row)] = row
+    state.note_limits()
+    state.macro_ran = True
+    return state.event(EventKind.UNKNOWN)
 
 
 def acceleration(state: MachineState, command: Command) -> int:
@@ -86,7 +100,7 @@ def set_retraction(state: MachineState, command: Command) -> int:
         if key in given:
             changed[field] = state.at_least(given[key], key, 1.0, command)
     state.change_retraction(**changed)
-    state.retracted = False
+    state.retracted.clear()
     return state.event(EventKind.MODE)
 
 

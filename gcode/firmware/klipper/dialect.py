@@ -58,6 +58,7 @@ PYTHON_WORDS: dict[str, Word] = {
     "@": host_command,
     "ACTIVATE_EXTRUDER": commands.activate_extruder,
     "SET_VELOCITY_LIMIT": commands.velocity_limit,
+    "RESET_VELOCITY_LIMIT": commands.reset_velocity_limit,
     "SET_GCODE_OFFSET": commands.gcode_offset,
     "SAVE_GCODE_STATE": commands.save_state,
     "RESTORE_GCODE_STATE": commands.restore_state,

@@ -3,8 +3,8 @@
 Steps are generated ahead of their motion, by the look-ahead of input shaper and pressure advance.
 SET_INPUT_SHAPER flushes them all: the next move starts later by the look-ahead before the command
 plus that after it. So does a SET_PRESSURE_ADVANCE that changes the time over which the extruder's
-speed is averaged, which is 0 without pressure advance. (Klipper before 2025-09-03 flushes for every
-SET_PRESSURE_ADVANCE.)
+speed is averaged, which is 0 without pressure advance. Klipper before 2025-09-03, and Kalico, flush
+for every SET_PRESSURE_ADVANCE: their machines name it among their ``stopping_macros``.
 
 Sources: klippy/toolhead.py (flush_step_generation, _calc_print_time), klippy/extras/
 motion_queuing.py, klippy/extras/input_shaper.py, klippy/kinematics/extruder.py
@@ -37,7 +37,7 @@ _EXTRUDER = re.compile(r"extruder(\d{0,2})")
 
 
 def pressure_advance(state: MachineState, command: Command) -> int:
-    """SET_PRESSURE_ADVANCE: stands still where an extruder's smooth time changes."""
+    """SET_PRESSURE_ADVANCE: stands still where an extruder's smooth time changes, or always."""
     given = state.extended(command)
     before_s = _ahead_s(state)
     extruder = int(state.i[at.I_TOOL])
@@ -51,7 +51,8 @@ def pressure_advance(state: MachineState, command: Command) -> int:
     for key in ("ADVANCE", "SMOOTH_TIME"):
         if key in given:
             state.factors[f"{key} {extruder}"] = _number(given[key])
-    if _extruder_smooth_s(state, extruder) == smooth_s:
+    always = command.name in map(str.upper, state.firmware.stopping_macros)
+    if _extruder_smooth_s(state, extruder) == smooth_s and not always:
         return state.event(EventKind.HARMLESS)
     return state.event(EventKind.STOP, before_s + _ahead_s(state))
 

@@ -35,7 +35,9 @@ class KlipperStreamCommands:
     positioning_sets_extruder = False
     folds_case = True
     coarse_extruder = False
+    relative_moves_count = True
     one_command = True
+    first_wins = False
     ignores_subcodes = False
     marks = True
     factors_need_axes = False

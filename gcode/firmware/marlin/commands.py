@@ -65,7 +65,7 @@ def axis_limits(fields: str) -> Handler:
                 state.warn(f"{command.name} {letter}{value:g} is not above 0 and is ignored")
                 continue
             values[fields.format(axis=letter.lower())] = scaled
-        return state.set_limits(command, values)
+        return state.set_limits(command, values, kind=state.limits_kind(command, "XYZE"))
 
     return handle
 

@@ -41,7 +41,9 @@ class MarlinStreamCommands:
     fence = b""
     positioning_sets_extruder = True
     coarse_extruder = True
+    relative_moves_count = True
     one_command = True
+    first_wins = False
     ignores_subcodes = True
     marks = False
     factors_need_axes = False

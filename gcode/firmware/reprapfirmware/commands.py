@@ -41,16 +41,15 @@ __all__ = [
     "tool",
 ]
 
-_MODES = (at.I_ABS_XYZ, at.I_ABS_E)
+_MODES = (at.I_ABS_XYZ, at.I_ABS_E, at.I_PLANE)
 _MOST_PUSHED = 10
 
 
 def accelerations(state: MachineState, command: Command) -> int:
     """M201, in mm/s2."""
     given = state.numbers(command, "XYZE")
-    return state.set_limits(
-        command, {f"accel_{k.lower()}_mm_s2": v for k, v in given.items() if v > 0.0}
-    )
+    values = {f"accel_{k.lower()}_mm_s2": v for k, v in given.items() if v > 0.0}
+    return state.set_limits(command, values, kind=state.limits_kind(command, "XYZE"))
 
 
 def speeds(state: MachineState, command: Command) -> int:
@@ -60,7 +59,7 @@ def speeds(state: MachineState, command: Command) -> int:
     values = {f"speed_{k.lower()}_mm_s": v * unit for k, v in given.items() if k != "I" and v > 0.0}
     if given.get("I", 0.0) > 0.0:
         values["min_speed_mm_s"] = given["I"] * unit
-    return state.set_limits(command, values)
+    return state.set_limits(command, values, kind=state.limits_kind(command, "XYZEIS"))
 
 
 def acceleration(state: MachineState, command: Command) -> int:
@@ -84,7 +83,7 @@ def jerk(state: MachineState, command: Command) -> int:
     for letter, value in given.items():
         field = f"jerk_{letter.lower()}_mm_s"
         values[field] = values[f"max_{field}"] = max(value / 60.0, 0.1)
-    return state.set_limits(command, values)
+    return state.set_limits(command, values, kind=state.limits_kind(command, "XYZEP"))
 
 
 def jerk_below_ceiling(state: MachineState, command: Command) -> int:
@@ -94,7 +93,8 @@ def jerk_below_ceiling(state: MachineState, command: Command) -> int:
         field = f"jerk_{letter.lower()}_mm_s"
         values[field] = min(max(value, 0.1), state.limit(f"max_{field}"))
     # What it does depends on the ceiling, so it is not remembered.
-    return state.set_limits(command, values, remember=False)
+    kind = state.limits_kind(command, "XYZE")
+    return state.set_limits(command, values, remember=False, kind=kind)
 
 
 def pressure_advance(state: MachineState, command: Command) -> int:
@@ -163,12 +163,15 @@ def retract_or_offsets(state: MachineState, command: Command) -> int:
 
 
 def _workspace(state: MachineState, command: Command) -> int:
-    """G10 L2 (origin in machine coordinates) and L20 (the tool is at these coordinates)."""
+    """G10 L2 (origin in machine coordinates) and L20 (the tool is at these coordinates).
+
+    They wait for standstill (GCodes3.cpp, GetSetWorkplaceCoordinates, 3.5); P0 is the one in use.
+    """
     given = state.numbers(command, "LPXYZ")
     kind = int(given.get("L", 0.0))
-    number = int(given.get("P", state.workspace + 1.0)) - 1
+    number = int(given.get("P", 0.0) or state.workspace + 1.0) - 1
     if kind not in (2, 20) or not 0 <= number <= 8:
-        raise state.problem("G10 L must be 1, 2 or 20, and P from 1 to 9", command)
+        raise state.problem("G10 L must be 1, 2 or 20, and P from 0 to 9", command)
     f = state.f
     place = {}
     for k, axis in enumerate("XYZ"):
@@ -177,8 +180,10 @@ def _workspace(state: MachineState, command: Command) -> int:
             place[k] = value if kind == 2 else float(f[at.F_LAST + k]) - value
             if kind == 20 and not state.i[at.I_KNOWN] >> k & 1:
                 state.i[at.I_ORIGIN_KNOWN] &= ~(1 << k)
+    if not place:
+        return state.event(EventKind.HARMLESS)
     set_workspace(state, number, place)
-    return state.event(EventKind.MODE)
+    return state.event(EventKind.STOP)
 
 
 def retract_settings(state: MachineState, command: Command) -> int:
@@ -192,7 +197,8 @@ def retract_settings(state: MachineState, command: Command) -> int:
     if "S" in given:
         changes["length_mm"] = max(given["S"], 0.0)
     if "R" in given:
-        changes["extra_mm"] = max(given["R"], -state.retraction.length_mm)
+        length_mm = changes.get("length_mm", state.retraction.length_mm)
+        changes["extra_mm"] = max(given["R"], -length_mm)
     if "F" in given:
         # One speed for both unless T follows; 60 mm/min is the least.
         changes["speed_mm_s"] = changes["return_speed_mm_s"] = max(given["F"], 60.0) / 60.0
@@ -206,12 +212,16 @@ def retract_settings(state: MachineState, command: Command) -> int:
 
 def special_move(state: MachineState, command: Command) -> int:
     """G0 and G1 with H (endstops, single motors) or R (from a saved place)."""
-    if state.numbers(command, "H").get("H", 0.0) != 0.0:
+    given = state.numbers(command, "HRXYZF")
+    if "F" in given:
+        status = set_feed(state.f, state.i, given["F"])
+        if status != at.OK:
+            return int(status)
+    if given.get("H", 0.0) != 0.0:
         state.forget()
         return state.event(EventKind.UNKNOWN)
     if "R" not in command.words:
         return -1
-    given = state.numbers(command, "RXYZF")
     saved = state.saved.get(f"G60 {int(given['R'])}")
     if saved is None or "E" in command.words:
         # Where the printer paused or changed tools last.
@@ -221,10 +231,6 @@ def special_move(state: MachineState, command: Command) -> int:
     for k, axis in enumerate("XYZ"):
         if axis in given:
             f[at.F_LAST + k] = saved.f[at.F_LAST + k] + given[axis] * f[at.F_UNIT_MM]
-    if "F" in given:
-        status = set_feed(f, state.i, given["F"])
-        if status != at.OK:
-            return int(status)
     return state.moved(state.travel())
 
 
@@ -268,7 +274,7 @@ def push_state(state: MachineState, command: Command) -> int:
 
 
 def pop_state(state: MachineState, _command: Command) -> int:
-    """M121: the modes, the units and F of the matching M120."""
+    """M121: the modes, the plane, the units and F of the matching M120."""
     depth = int(state.factors.get("pushed", 0.0)) - 1
     if depth < 0:
         state.warn("M121 without M120 is ignored")

@@ -44,7 +44,9 @@ class RepRapStreamCommands:
     positioning_sets_extruder = False
     folds_case = True
     coarse_extruder = False
+    relative_moves_count = False
     one_command = False
+    first_wins = True
     ignores_subcodes = False
     marks = False
     factors_need_axes = True
