@@ -88,12 +88,12 @@ class DryFriction:
     """
 
     def __init__(self, held_mm: Sequence[float], dt_s: float) -> None:
-        self._held, self._kept = tuple(held_mm), _kept(dt_s)
+        self._held, self._kept = np.array(held_mm, float), _kept(dt_s)
         self._states: Array | None = None
 
     def __bool__(self) -> bool:
         """Whether any axis has friction."""
-        return any(self._held)
+        return bool(self._held.any())
 
     def stand(self) -> None:
         """Reset to standstill with unbent guides."""
@@ -107,8 +107,8 @@ class DryFriction:
             first = command_mm[:, 0]
             self._states = np.stack([first, np.zeros(len(first))], axis=1)
         out = np.empty(command_mm.shape)
-        for row, held, state, to in zip(command_mm, self._held, self._states, out, strict=True):
-            received(np.ascontiguousarray(row), held, BEND_MM, self._kept, state, to)
+        command_mm = np.ascontiguousarray(command_mm)
+        received(command_mm, self._held, BEND_MM, self._kept, self._states, out)
         return out
 
 
