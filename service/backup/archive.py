@@ -330,7 +330,8 @@ def _hold_back(database: Path) -> None:
             )
             # One that an earlier restore held back is there already.
             connection.execute(
-                "INSERT OR IGNORE INTO deliveries (job_id, kind, target, state, attempts, next_at, error) "
+                "INSERT OR IGNORE INTO deliveries "
+                "(job_id, kind, target, state, attempts, next_at, error) "
                 "SELECT id, 'printer', printer, 'failed', 0, 0, ? FROM jobs "
                 "WHERE state IN ('queued', 'running') AND printer IS NOT NULL",
                 (why,),
