@@ -23,6 +23,7 @@ import numpy as np
 
 from stillpath.models._friction_kernels import bent, received
 from stillpath.models.arrays import Array
+from stillpath.models.plant_specs import MOST_FRICTION_MM
 from stillpath.models.plants import PlantSetSpec, frequency_response
 
 __all__ = [
@@ -59,7 +60,8 @@ def held_back_mm(plants: PlantSetSpec, accel_mm_s2: float) -> float:
 
 def with_least_friction(plants: PlantSetSpec) -> PlantSetSpec:
     """Return plants whose measurement cannot show friction with the least that guides have."""
-    return plants.with_friction(held_back_mm(plants, LEAST_MM_S2), assumed=True)
+    held_mm = min(held_back_mm(plants, LEAST_MM_S2), MOST_FRICTION_MM)
+    return plants.with_friction(held_mm, assumed=True)
 
 
 def bend_of(way_mm: Array, dt_s: float = 0.0) -> Array:
