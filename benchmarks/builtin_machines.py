@@ -85,7 +85,8 @@ def identified(base: Machine, tables: list[Path]) -> Machine:
         count = len(plants.weighted_members())
         print(f"{base.name} {axis}: {about.residual:.2f} dB, {count} members, {modes}", flush=True)
     source = _SOURCE.format(", ".join(path.name for path in tables))
-    document = {**found.machine.model_dump(), "source": source}
+    # Figures of the documentation, and files that users have, are of guides that do not rub.
+    document = {**found.machine.without_friction().model_dump(), "source": source}
     return Machine.model_validate(document)
 
 

@@ -82,6 +82,8 @@ class FrictionCompensator(Overlay):
         beyond = partial(self._bounds.beyond, wanted_mm=wanted)
         u = self._against(wanted, rests, _ROUNDED_S[0])
         for rounded_s in _ROUNDED_S[1:]:
+            if not np.any(beyond(u)):
+                return u
             u = eased(u, self._against(wanted, rests, rounded_s), beyond, self._dt_s, _PASSES)
         u = eased(u, wanted, beyond, self._dt_s, _LAST_PASSES)
         left = np.any(beyond(u), axis=1, keepdims=True)

@@ -31,25 +31,28 @@ def bent(way: Array, bend: float, kept: float, out: Array) -> None:
 
 @kernel(allocates=False)
 def received(
-    command: Array, held: float, bend: float, kept: float, state: Array, out: Array
+    command: Array, held: Array, bend: float, kept: float, states: Array, out: Array
 ) -> None:
-    """Solve w + held bent(w) = command; `state` is (w, bent) of the last sample."""
-    w, now = state[0], state[1]
-    for k in range(len(command)):
-        now *= kept
-        # What the guides let go of moves the axis as a command does.
-        step = command[k] - (w + held * now)
-        if step != 0.0:
-            towards = 1.0 if step > 0.0 else -1.0
-            asked, way = abs(step), 0.0
-            # way + room (1 - exp(-way / bend)) = asked: concave, Newton from 0 stays below.
-            room = held * (1.0 - towards * now)
-            for _ in range(_ROUNDS):
-                left = np.exp(-way / bend)
-                way += (asked - way - room * (1.0 - left)) / (1.0 + room * left / bend)
-            w += towards * way
-            now = towards + (now - towards) * np.exp(-way / bend)
-            # What three rounds leave is not lost.
-            w = command[k] - held * now
-        out[k] = w
-    state[0], state[1] = w, now
+    """Solve w + held bent(w) = command for every axis; `states` are (w, bent) of the last sample.
+
+    Axis by axis takes twice as long: what one waits for, the other computes meanwhile.
+    """
+    axes, samples = command.shape
+    for k in range(samples):
+        for axis in range(axes):
+            w, now = states[axis, 0], states[axis, 1] * kept
+            # What the guides let go of moves the axis as a command does.
+            step = command[axis, k] - (w + held[axis] * now)
+            if step != 0.0:
+                towards = 1.0 if step > 0.0 else -1.0
+                asked, way = abs(step), 0.0
+                # way + room (1 - exp(-way / bend)) = asked: concave, Newton from 0 stays below.
+                room = held[axis] * (1.0 - towards * now)
+                for _ in range(_ROUNDS):
+                    left = np.exp(-way / bend)
+                    way += (asked - way - room * (1.0 - left)) / (1.0 + room * left / bend)
+                now = towards + (now - towards) * np.exp(-way / bend)
+                # What three rounds leave is not lost.
+                w = command[axis, k] - held[axis] * now
+            states[axis, 0], states[axis, 1] = w, now
+            out[axis, k] = w

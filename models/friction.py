@@ -23,6 +23,7 @@ import numpy as np
 
 from stillpath.models._friction_kernels import bent, received
 from stillpath.models.arrays import Array
+from stillpath.models.plant_specs import MOST_FRICTION_MM
 from stillpath.models.plants import PlantSetSpec, frequency_response
 
 __all__ = [
@@ -59,7 +60,8 @@ def held_back_mm(plants: PlantSetSpec, accel_mm_s2: float) -> float:
 
 def with_least_friction(plants: PlantSetSpec) -> PlantSetSpec:
     """Return plants whose measurement cannot show friction with the least that guides have."""
-    return plants.with_friction(held_back_mm(plants, LEAST_MM_S2), assumed=True)
+    held_mm = min(held_back_mm(plants, LEAST_MM_S2), MOST_FRICTION_MM)
+    return plants.with_friction(held_mm, assumed=True)
 
 
 def bend_of(way_mm: Array, dt_s: float = 0.0) -> Array:
@@ -88,12 +90,12 @@ class DryFriction:
     """
 
     def __init__(self, held_mm: Sequence[float], dt_s: float) -> None:
-        self._held, self._kept = tuple(held_mm), _kept(dt_s)
+        self._held, self._kept = np.array(held_mm, float), _kept(dt_s)
         self._states: Array | None = None
 
     def __bool__(self) -> bool:
         """Whether any axis has friction."""
-        return any(self._held)
+        return bool(self._held.any())
 
     def stand(self) -> None:
         """Reset to standstill with unbent guides."""
@@ -107,8 +109,8 @@ class DryFriction:
             first = command_mm[:, 0]
             self._states = np.stack([first, np.zeros(len(first))], axis=1)
         out = np.empty(command_mm.shape)
-        for row, held, state, to in zip(command_mm, self._held, self._states, out, strict=True):
-            received(np.ascontiguousarray(row), held, BEND_MM, self._kept, state, to)
+        command_mm = np.ascontiguousarray(command_mm)
+        received(command_mm, self._held, BEND_MM, self._kept, self._states, out)
         return out
 
 

@@ -211,10 +211,11 @@ def prediction_note(machine: Machine, choice: Choice) -> str:
 
 def _friction_unseen(machine: Machine) -> str:
     unseen_um = {
-        axis.upper(): 1e3 * (unseen_friction_mm(plants) + (plants.friction_mm or 0.0))
+        axis.upper(): 1e3 * (unseen_mm + (plants.friction_mm or 0.0))
         for axis, plants in sorted(machine.axes.items())
+        if (unseen_mm := unseen_friction_mm(plants))
     }
-    held = " and ".join(f"{um:.0f} µm ({axis})" for axis, um in unseen_um.items() if um)
+    held = " and ".join(f"{um:.0f} µm ({axis})" for axis, um in unseen_um.items())
     if not held:
         return ""
     return (

@@ -90,12 +90,19 @@ class MachineStream:
         out : ndarray, shape (2, n), optional
             Where the answer is written to.
         """
-        received = self._friction.received_mm(self._ripple.received_mm(u_mm))
+        return self.answer(self.received_mm(u_mm), path_mm, out)
+
+    def received_mm(self, u_mm: Array) -> Array:
+        """Return the next block of a command as ripple and dry friction let the plants have it."""
+        return self._friction.received_mm(self._ripple.received_mm(u_mm))
+
+    def answer(self, received_mm: Array, path_mm: Array, out: Array | None = None) -> Array:
+        """Return the positions that answer a command which the plants have received; see `push`."""
         if self._remembered:
-            past = np.concatenate([self._past, received], axis=1)
+            past = np.concatenate([self._past, received_mm], axis=1)
             self._past = past[:, -self._remembered :].copy()
-        moved = np.empty(u_mm.shape) if out is None else out
-        self._answer(received, path_mm, moved)
+        moved = np.empty(received_mm.shape) if out is None else out
+        self._answer(received_mm, path_mm, moved)
         if self._machine.ripple:
             moved += self._ripple.added_mm(path_mm)
         return moved

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 
 import numpy as np
@@ -14,6 +15,8 @@ from stillpath.gcode.pieces import VerbatimPart
 from stillpath.gcode.types import EventKind, Limits
 
 __all__ = ["ends_at_mark", "file_text"]
+
+_UNITS = re.compile(rb"\s*(?:N\d+\s*)?(?:G2[01]|M200)(?!\d)", re.IGNORECASE)
 
 Inserted = Iterator[tuple[int, bytes]]
 """Places in the bytes of a part, and the lines that come there."""
@@ -41,7 +44,7 @@ def file_text(
         The part begins behind an object's mark, and no move in between.
     """
     inserted = list(_mark_lines(verbatim, commands)) if marked else []
-    if extruder_mm is not None:
+    if extruder_mm is not None and not _changes_units(verbatim):
         in_force = commands.in_stream if marked else _as_it_is
         inserted += _behind_skipped(verbatim, commands, extruder_mm, in_force, behind_mark)
     parts, done = [], 0
@@ -54,6 +57,12 @@ def file_text(
 def ends_at_mark(verbatim: VerbatimPart) -> bool:
     """Return whether no move stands behind the last mark by which a host skips objects."""
     return bool(np.any(_host_marks(verbatim) == len(verbatim.moves)))
+
+
+def _changes_units(verbatim: VerbatimPart) -> bool:
+    """Return whether lines of ours, in millimetres, may be read otherwise in a part."""
+    rows = np.flatnonzero(verbatim.events.kind == EventKind.STATE).tolist()
+    return any(_UNITS.match(verbatim.line(verbatim.events, row)) for row in rows)
 
 
 def _mark_lines(verbatim: VerbatimPart, commands: StreamCommands) -> Inserted:

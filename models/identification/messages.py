@@ -90,13 +90,14 @@ def body_notes(friction_mm: float, frame: Frame | None) -> list[str]:
 
 
 def friction_notes(plants: PlantSetSpec) -> list[str]:
-    """Return what is assumed of friction, which spectra do not show."""
+    """Return what is assumed of friction, which neither spectra show nor logs without a model."""
     if not plants.friction_assumed:
         return []
     held_um = 1e3 * (plants.friction_mm or 0.0)
     note = (
-        f"dry friction was not measured (raw logs show it): {1e-3 * LEAST_MM_S2:g} N per kg of "
-        f"moving mass is assumed, which holds the axis {held_um:.1f} µm behind its command"
+        "dry friction is not known (raw logs that a model explains show it): "
+        f"{1e-3 * LEAST_MM_S2:g} N per kg of moving mass is assumed, which holds the axis "
+        f"{held_um:.1f} µm behind its command"
     )
     return [note]
 

@@ -8,8 +8,9 @@ frequencies only, and errors are those of the shaped plan.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,7 +90,6 @@ class Trial:
         self._distance = PathDistances(self._path, dt_s)
         self._machine, self._members = machine, members
         self._commutes = not (machine.ripple or any(machine.friction_mm))
-        self._answers = [self._answer(member, self._path) for member in members]
         self._index = {
             f: spread(np.flatnonzero(motion.feature == f).astype(np.int64), _POINTS)
             for f in np.unique(motion.feature).tolist()
@@ -122,11 +122,10 @@ class Trial:
 
     def _distances(self, shapings: Mapping[OperatingPoint, Shaping] | Shaping, at: Ints) -> Array:
         """Return contour errors [mm] at chosen samples, shape (members, len(at))."""
-        out = np.empty((len(self._answers), len(at)))
+        out = np.empty((len(self._members), len(at)))
         if not self._commutes:
-            command = self._command(shapings)
-            for row, member in zip(out, self._members, strict=True):
-                row[:] = self._distance.at(self._answer(member, command)[:, at], at)
+            for row, answer in zip(out, self._answers_to(self._command(shapings)), strict=True):
+                row[:] = self._distance.at(answer[:, at], at)
             return out
         for row, answer in zip(out, self._answers, strict=True):
             y = np.empty((2, len(at)))
@@ -173,14 +172,24 @@ class Trial:
             parts.append(shaped(self._path[:, first:last], shaping, self._dt_s))
         return np.concatenate(parts, axis=1)
 
-    def _answer(self, member: int | None, command_mm: Array) -> Array:
+    @cached_property
+    def _answers(self) -> list[Array]:
+        return list(self._answers_to(self._path))
+
+    def _answers_to(self, command_mm: Array) -> Iterator[Array]:
+        """Yield every member's positions; ripple and guides are the same for all of them."""
+        received_mm = MachineStream(self._machine, self._dt_s).received_mm(command_mm)
+        for member in self._members:
+            yield self._answer(member, received_mm)
+
+    def _answer(self, member: int | None, received_mm: Array) -> Array:
         parts = [np.zeros((2, 0))]
         stream: MachineStream | None = None
         for first, last, point in self._bounds:
             if stream is None:
                 stream = MachineStream(self._machine, self._dt_s, point, member=member)
             stream.operate_at(point)
-            parts.append(stream.push(command_mm[:, first:last], self._path[:, first:last]))
+            parts.append(stream.answer(received_mm[:, first:last], self._path[:, first:last]))
         return np.concatenate(parts, axis=1)
 
     def _shape(self, answer: Array, shaping: Shaping, at: Ints, out: Array) -> None:

@@ -132,7 +132,9 @@ class SetErrors:
         landing = extruding & self._landing(classes == TRAVEL)
         self._waiting.append((classes[due], extruding[due], landing[due]))
         self._count += n
-        answers = np.stack([stream.push(command_mm, path_mm) for stream in self._streams])
+        # Ripple and guides are the same for all of them.
+        received_mm = self._streams[0].received_mm(command_mm)
+        answers = np.stack([stream.answer(received_mm, path_mm) for stream in self._streams])
         self._note(self._meter.push(path_mm, answers))
 
     def finish(self) -> None:

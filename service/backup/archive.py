@@ -328,8 +328,10 @@ def _hold_back(database: Path) -> None:
                 "WHERE state IN ('waiting', 'sending') AND kind = 'printer'",
                 (why,),
             )
+            # One that an earlier restore held back is there already.
             connection.execute(
-                "INSERT INTO deliveries (job_id, kind, target, state, attempts, next_at, error) "
+                "INSERT OR IGNORE INTO deliveries "
+                "(job_id, kind, target, state, attempts, next_at, error) "
                 "SELECT id, 'printer', printer, 'failed', 0, 0, ? FROM jobs "
                 "WHERE state IN ('queued', 'running') AND printer IS NOT NULL",
                 (why,),

@@ -56,11 +56,13 @@ def test_an_axis_that_stands_creeps_to_its_command() -> None:
     assert abs(ahead[0, stopped + round(10 * CREEP_S / DT_S)]) < 1e-3 * HELD_MM[0]
 
 
-def test_blocks_make_no_difference() -> None:
+def test_blocks_and_other_axes_make_no_difference() -> None:
     whole = DryFriction(HELD_MM, DT_S).received_mm(WAYS)
     friction = DryFriction(HELD_MM, DT_S)
     parts = [friction.received_mm(WAYS[:, a : a + 700]) for a in range(0, 3000, 700)]
     np.testing.assert_array_equal(np.hstack(parts), whole)
+    alone = [DryFriction(HELD_MM[k:][:1], DT_S).received_mm(WAYS[k:][:1]) for k in (0, 1)]
+    np.testing.assert_array_equal(np.vstack(alone), whole)
     friction.stand()
     np.testing.assert_array_equal(friction.received_mm(WAYS), whole)
 

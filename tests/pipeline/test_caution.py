@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 from stillpath.compensation.registry import compensator
 from stillpath.compensation.shapers import ShaperCompensator
 from stillpath.models.firmware.klipper import FirmwareShaper
+from stillpath.models.friction import with_least_friction
 from stillpath.models.machine import Machine
 from stillpath.models.plants import (
     PlantSetSpec,
@@ -80,6 +82,11 @@ def test_a_wide_set_asks_for_more_of_the_shaper(tmp_path: Path) -> None:
     assert narrow.mean < wide.mean <= wide.worst
 
 
+def with_axes(machine: Machine, **change: Callable[[PlantSetSpec], PlantSetSpec]) -> Machine:
+    axes = {k: change.get(k, lambda axis: axis)(axis) for k, axis in machine.axes.items()}
+    return machine.model_copy(update={"axes": axes})
+
+
 @pytest.mark.parametrize("name", ["ender3", pytest.param("voron-v24-250", marks=pytest.mark.slow)])
 def test_no_member_fares_worse_than_with_the_shaper(name: str, cache: Path) -> None:
     """The promise, member by member, measured without the code that made the choice."""
@@ -93,6 +100,10 @@ def test_no_member_fares_worse_than_with_the_shaper(name: str, cache: Path) -> N
     note = prediction_note(machine, choice)
     assert f"({choice.worst:.2f} for the worst plant)" in note
     assert re.search(r"an axis back by \d+ µm \(X\) and \d+ µm \(Y\); more is possible", note)
+    rubbing = with_axes(machine, x=with_least_friction, y=with_least_friction)
+    assert prediction_note(rubbing, choice) == note
+    known = with_axes(rubbing, x=lambda axis: axis.with_friction(0.004))
+    assert re.search(r"an axis back by \d+ µm \(Y\); more", prediction_note(known, choice))
     path, extruding = reference_motion(DT_S)
     ours = compensator("fbf", machine, DT_S, robust="ensemble", caution=caution)
     ours.reset(path[:, 0])

@@ -55,6 +55,9 @@ def test_assumed_friction_is_part_of_what_is_unseen() -> None:
     assert whole_mm == pytest.approx(unseen_friction_mm(axis(48.0)), rel=1e-12)
     measured = assumed.with_friction(assumed.friction_mm)
     assert unseen_friction_mm(measured) == 0.0
+    # What bends far is still a document that can be read.
+    soft = with_least_friction(axis(4.5))
+    assert PlantSetSpec.model_validate(soft.model_dump()) == soft
 
 
 def printer(f_hz: dict[str, float], force_n_kg: float) -> Bodies:

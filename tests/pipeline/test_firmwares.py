@@ -178,3 +178,13 @@ def test_a_rest_with_a_feedrate_that_marlin_passes_over(tmp_path: Path, cache: P
     result, written = compensated(data, tmp_path, cache, ender3_with("marlin"))
     assert result.put_back == []
     assert differences(data, written, ender3_with("marlin")) == []
+
+
+def test_behind_m200_no_line_of_ours_counts_in_millimetres(tmp_path: Path, cache: Path) -> None:
+    """Cubic ones are counted there, and moves stay as sliced, behind an object's mark too."""
+    sliced = b"; printing object b\nG1 X90 Y90 F6000\nG1 X95 E3.1 F1200\n"
+    text = b"G28\nG90\nM82\nG1 Z0.2 F600\n; printing object a\nG1 X40 Y50 F6000\nG1 X70 E1 F3600\n"
+    text += b"G1 Y80 E2\nG1 X40 E3\nM400\nM200 D1.75\n"
+    _, written = compensated(text + sliced, tmp_path, cache, ender3_with("marlin"))
+    assert b"; stillpath: stream off" in written
+    assert sliced in written

@@ -127,6 +127,17 @@ def test_the_best_kind_is_used_and_the_others_are_named() -> None:
     assert found.plants.provenance.kind == "raw log"
     told = [n for n in found.notes if n.startswith(psd.name)]
     assert told == [f"{psd.name}: not used, because a raw log of axis x says more"]
+    assert not found.plants.friction_assumed
+
+
+def test_tables_do_not_show_friction_so_a_little_is_assumed() -> None:
+    found = one(spectrum_file(one_mode(50.0, 0.06), QUICK, sensor=Sensor(rate_hz=1600.0)))
+    assert found.plants.friction_assumed
+    held_mm = 75.0 / (2.0 * np.pi * 50.0) ** 2
+    assert found.plants.friction_mm == pytest.approx(held_mm, rel=0.1)
+    assert any(
+        "0.075 N per kg" in note and f"{1e3 * held_mm:.1f} µm" in note for note in found.notes
+    )
 
 
 def test_a_model_goes_before_measurements() -> None:
@@ -607,6 +618,8 @@ def test_logs_whose_phase_no_model_explains_count_as_tables() -> None:
     assert about is not None
     assert about.magnitude_only
     assert any("only the size of the vibrations" in text for text in found.warnings)
+    assert found.plants.friction_assumed is any("mass is assumed" in note for note in found.notes)
+    assert found.plants.friction_assumed is not any("dry friction holds" in n for n in found.notes)
     assert main_mode(found) == pytest.approx(42.0, rel=0.05)
 
 

@@ -146,7 +146,9 @@ def test_a_restore_starts_no_print_and_replaces_no_file_of_a_printer(store, data
     write(data / f"jobs/{done.id}/1/result/part.stillpath.gcode", "G28\n")
     store.apply(done.id, finished(store.claim(done.id, 1500.0, "w")))
     back_up(data, tmp_path / "b.tar")
-    restore(tmp_path / "b.tar", tmp_path / "new")
+    restore(tmp_path / "b.tar", tmp_path / "first")
+    back_up(tmp_path / "first", tmp_path / "again.tar")
+    restore(tmp_path / "again.tar", tmp_path / "new")
     engine = open_database(Settings(data_dir=tmp_path / "new"))
     restored = JobStore(engine)
     assert restored.get(waiting.id).print_after is False
