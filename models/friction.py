@@ -24,7 +24,7 @@ import numpy as np
 from stillpath.models._friction_kernels import bent, received
 from stillpath.models.arrays import Array
 from stillpath.models.plant_specs import MOST_FRICTION_MM
-from stillpath.models.plants import PlantSetSpec, frequency_response
+from stillpath.models.plants import PlantSetSpec, RelativeModesSpec, frequency_response
 
 __all__ = [
     "BEND_MM",
@@ -44,6 +44,8 @@ CREEP_S = 0.05
 LEAST_MM_S2 = 75.0
 """Dry friction over moving mass that is assumed where none could be measured. Most guides rub more;
 more would make stiff printers with light guides worse (docs/tried.md)."""
+_FRAME_BELOW = 0.8
+"""Highest frequency of a frame on its feet, over that of the main mode."""
 _SLOW_HZ = 3.0
 """Well below all modes: there a plant follows its command but for the bend of its springs."""
 
@@ -59,9 +61,18 @@ def held_back_mm(plants: PlantSetSpec, accel_mm_s2: float) -> float:
 
 
 def with_least_friction(plants: PlantSetSpec) -> PlantSetSpec:
-    """Return plants whose measurement cannot show friction with the least that guides have."""
-    held_mm = min(held_back_mm(plants, LEAST_MM_S2), MOST_FRICTION_MM)
-    return plants.with_friction(held_mm, assumed=True)
+    """Return plants whose measurement cannot show friction with the least that guides have.
+
+    Modes well below the main one may be the frame's, which friction inside the printer does not
+    bend.
+    """
+    held_mm, nominal = held_back_mm(plants, LEAST_MM_S2), plants.nominal
+    if isinstance(nominal, RelativeModesSpec):
+        main = max(nominal.modes, key=lambda mode: abs(mode.share))
+        springs = [mode for mode in nominal.modes if mode.f_hz >= _FRAME_BELOW * main.f_hz]
+        bend_s2 = sum(mode.share / (2.0 * np.pi * mode.f_hz) ** 2 for mode in springs)
+        held_mm = min(held_mm, LEAST_MM_S2 * abs(bend_s2))
+    return plants.with_friction(min(held_mm, MOST_FRICTION_MM), assumed=True)
 
 
 def bend_of(way_mm: Array, dt_s: float = 0.0) -> Array:

@@ -53,6 +53,11 @@ def test_assumed_friction_is_part_of_what_is_unseen() -> None:
     assert assumed.friction_mm == pytest.approx(75.0 / (2 * np.pi * 48.0) ** 2, rel=0.02)
     whole_mm = assumed.friction_mm + unseen_friction_mm(assumed)
     assert whole_mm == pytest.approx(unseen_friction_mm(axis(48.0)), rel=1e-12)
+    shaken = axis(48.0).nominal.modes[0].model_copy(update={"share": 0.8})
+    frame = RelativeMode(f_hz=9.0, zeta=0.1, share=0.2)
+    on_feet = PlantSetSpec(nominal=RelativeModesSpec(modes=(shaken, frame)), provenance=TABLE)
+    bent_mm = with_least_friction(on_feet).friction_mm
+    assert bent_mm == pytest.approx(0.8 * assumed.friction_mm, rel=0.02)
     measured = assumed.with_friction(assumed.friction_mm)
     assert unseen_friction_mm(measured) == 0.0
     # What bends far is still a document that can be read.
