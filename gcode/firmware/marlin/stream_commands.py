@@ -42,6 +42,7 @@ class MarlinStreamCommands:
     positioning_sets_extruder = True
     coarse_extruder = True
     relative_moves_count = True
+    replays = False
     one_command = True
     first_wins = False
     ignores_subcodes = True
