@@ -11,6 +11,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from stillpath.gcode.firmware.line_reader import EXTRUSION
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.pieces import Piece, VerbatimPart
 from stillpath.gcode.plan import plan_moves
@@ -68,6 +69,7 @@ class Splitter:
     ) -> None:
         self._machine = machine
         self._adapter = adapter(machine)
+        self._replays = self._adapter.stream_commands().replays
         self._longest_s = longest_s
         self._compensate = compensate
         self._moves: Moves | None = None
@@ -143,8 +145,8 @@ class Splitter:
     def _first_barrier(self, events: Events, most: int) -> int | None:
         """Return the first of `most` moves after which a piece must end; None: there is none.
 
-        A piece ends at a stop, a G92 other than one plain E, M221, and a change of the stream's
-        limits, but not at those before its first move.
+        A piece ends at a stop, a G92 other than one plain E, M221, a change of the stream's limits,
+        and at M82 if the firmware replays moves, but not at those before its first move.
         """
         limits, modal = self._tables
         count = int(np.searchsorted(events.move_index, most, "right"))
@@ -166,13 +168,15 @@ class Splitter:
             end = min([end, *rows[behind_move[rows]][:1].tolist()])
         for row in of_mode[behind_move[of_mode] & (of_mode < end)].tolist():
             start, stop = events.byte_start[row], events.byte_end[row]
-            if _shifts_origin(self._text[start - self._text_offset : stop - self._text_offset]):
+            line = self._text[start - self._text_offset : stop - self._text_offset]
+            counts = self._replays and modal[int(events.modal_id[row])].absolute_e
+            if _shifts_origin(line) or (counts and EXTRUSION.match(line)):
                 end = row
                 break
         return int(events.move_index[end]) if end < count else None
 
     def _raw_moves(self, block: ProgramBlock) -> NDArray[np.bool_]:
-        """Mark moves of X or Y that must keep their lines, and all that bring back a state."""
+        """Mark moves of X or Y that must keep their lines, and others that must end a piece."""
         moves = block.moves
         travel, xy = moves.end_mm - moves.start_mm, moves.moves_xy
         # Our lines state positions, so a move of Z cannot be replaced where Z is unknown.
@@ -191,6 +195,10 @@ class Splitter:
             # A piece cannot begin or end within a line, nor where X and Y rest.
             spread = np.maximum.reduceat(raw, starts) | ~xy[starts] | ~xy[ends - 1]
             raw = np.repeat(spread, ends - starts) & xy
+        if self._replays:
+            # Lines that find E absolute must not stand among those of a stream.
+            absolute = np.array([state.absolute_e for state in block.modal], bool)
+            raw |= ~xy & absolute[moves.modal_id]
         return np.asarray(raw | ((moves.known & OF_STATE) != 0))
 
     def _marked(self, moves: Moves, events: Events, raw: NDArray[np.bool_]) -> Moves:

@@ -149,6 +149,13 @@ class StreamCommands(Protocol):
         """Absolute E goes on from where relative moves have ended (not in RepRapFirmware)."""
 
     @property
+    def replays(self) -> bool:
+        """After a pause, moves that waited are read again, and E as it was last said to be.
+
+        So M82 and M83 must not stand among moves without a stop (RepRapFirmware).
+        """
+
+    @property
     def shaper_off(self) -> bytes:
         """Lines that switch the firmware's own input shaper off; empty: it has none."""
 

@@ -356,7 +356,8 @@ class StreamWriter:
     def _lead(self, piece: Piece, extruder_mm: float) -> bytes:
         """Return those of them that still move under the file's limits, or stand."""
         parts: list[bytes] = []
-        if not (self._at_rest or piece.after_mark):
+        counts = piece.modal_before.absolute_e and self._stream_commands.replays
+        if not self._at_rest and (counts or not piece.after_mark):
             parts.append(self._stream_commands.stand_still)
         if self._modal is None:
             self._modal = piece.modal_before
@@ -392,7 +393,9 @@ class StreamWriter:
         if not self._streaming:
             marking = limits is not verbatim.limits_before
             return (self._stream_commands.limits(limits) if marking else self._unmarked()) + shaper
-        stop = b"" if self._at_rest or self._rests(verbatim) else self._stream_commands.stand_still
+        counts = verbatim.modal_before.absolute_e and self._stream_commands.replays
+        rests = self._at_rest or (self._rests(verbatim) and not counts)
+        stop = b"" if rests else self._stream_commands.stand_still
         line_note = b", line %d of the original" % verbatim.first_line
         text = stop + self._stream_off(limits, verbatim.modal_before, extruder_mm, line_note)
         return text + shaper

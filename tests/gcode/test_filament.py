@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from tests.compensating import compensated
 from tests.fuzz.machines import machine_of
-from tests.gcode.plain_reader import read
+from tests.gcode.plain_reader import is_motion, read
 from tests.gcode.states import differences, tagged
 
 KINDS = ("klipper", "marlin", "reprapfirmware")
@@ -109,6 +109,28 @@ def test_absolute_e_of_reprapfirmware(change: str, cache: Path) -> None:
             for data in (text.encode(), written)
         )
         assert after == pytest.approx(before, abs=FILAMENT_MM)
+
+
+@pytest.mark.parametrize(
+    "between", ["", "M82", "M400", "G4 P20", "M486 S1", "G92 E3.4\nM82", "G10\nG11"]
+)
+def test_a_pause_of_reprapfirmware_finds_e_as_it_was(between: str, cache: Path) -> None:
+    """It reads moves again that waited, but not the M82 or M83 before them."""
+    text = START.replace("M83", "M82\nG92 E0").replace("E2.1", "E4.4")
+    text += f"G1 E3.4 F2100\nG1 Z.6\n{between}\nG1 X60 F6000\n{between}\nG1 Z.3\nG1 E4.4 F2100\n"
+    text += f"G1 Y60 E6.5\nG1 Z.4\n{between}\nG1 X90 E8.6\n{between}\nG1 Y90 E10.7\nG1 E9 F900\n"
+    written = check(text, "reprapfirmware", cache, reverts=False)
+    assert written.count(b"stream on") >= 2
+    mode, waits = b"M82", False
+    for line in written.splitlines():
+        code = line.split(b";")[0].strip()
+        if code in (b"M82", b"M83"):
+            assert code == mode or not waits, line
+            mode = code
+        elif code.startswith((b"G4", b"M400", b"M572", b"M593")):
+            waits = False
+        elif is_motion(code):
+            waits = True
 
 
 @pytest.mark.parametrize("decimals", [5, 7])

@@ -151,6 +151,9 @@ def test_the_shaper_of_the_firmware() -> None:
     stream_commands = MarlinStreamCommands(Marlin(shaper=shaper))
     assert stream_commands.shaper_off == b"M593 F0\n"
     assert stream_commands.shaper_on == b"M593 X F40 D0.15\nM593 Y F35.5 D0.15\n"
+    # A build without INPUT_SHAPING_Y takes the line of Y for X.
+    alone = MarlinStreamCommands(Marlin(shaper=MarlinShaper(freq_x_hz=40.0)))
+    assert alone.shaper_on == b"M593 Y F0 D0.15\nM593 X F40 D0.15\n"
     for none in (Marlin(variant="2.0"), Marlin(shaper=MarlinShaper())):
         assert (MarlinStreamCommands(none).shaper_off, MarlinStreamCommands(none).shaper_on) == (
             b"",

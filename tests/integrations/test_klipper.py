@@ -207,14 +207,22 @@ def test_the_second_file_needs_a_macro():
         Klipper(macros_of(OURS, M600))
 
 
-def test_a_klipper_from_before_2024():
+@pytest.mark.parametrize(
+    ("stated", "restored"),
+    [
+        ({"max_accel_to_decel": 2500.0}, "ACCEL_TO_DECEL=2500.0"),
+        # For some days after its change the default of minimum_cruise_ratio was not among settings.
+        ({}, "MINIMUM_CRUISE_RATIO=0.5"),
+    ],
+)
+def test_a_klipper_from_before_april_2024(stated: dict, restored: str):
     settings = {"printer": dict(SETTINGS["printer"]), "input_shaper": SETTINGS["input_shaper"]}
     del settings["printer"]["minimum_cruise_ratio"]
-    settings["printer"]["max_accel_to_decel"] = 2500.0
+    settings["printer"] |= stated
     printer = in_stretch(OURS, settings=settings)
     before = limits(printer)
     printer.run("PAUSE")
-    assert printer.sent[0] == OWN + "ACCEL_TO_DECEL=2500.0"
+    assert printer.sent[0] == OWN + restored
     printer.run("RESUME")
     assert limits(printer) == before
 

@@ -141,6 +141,15 @@ def test_a_smoother_is_set_by_its_own_frequency() -> None:
     assert adviser.read_shaper(read, Shaping()) == wanted
 
 
+def test_a_build_that_shapes_x_alone_keeps_the_line_of_x() -> None:
+    """It passes over the Y of M593, and takes that line for X."""
+    firmware = Marlin(shaper=MarlinShaper(freq_x_hz=40.0))
+    machine = klipper().model_copy(update={"firmware": firmware})
+    adviser = adapter(machine).adviser(Interpreter(machine).dialect)
+    wanted = Shaping(AxisShaper("zv", 44.4), AxisShaper("zv", 31.3, 0.05))
+    assert adviser.shaper_lines(wanted) == (b"M593 Y F31.3 D0.05", b"M593 X F44.4 D0.1")
+
+
 @pytest.mark.parametrize(
     ("version", "lines", "own"),
     [

@@ -36,6 +36,7 @@ class KlipperStreamCommands:
     folds_case = True
     coarse_extruder = False
     relative_moves_count = True
+    replays = False
     one_command = True
     first_wins = False
     ignores_subcodes = False

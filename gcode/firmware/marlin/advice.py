@@ -94,10 +94,13 @@ class MarlinAdviser:
                 f"M493 {axis} C{_COMPENSATORS[s.type]} A{s.f_hz:.6g} I{s.damping:.6g}".encode()
                 for axis, s in (("X", shaping.x), ("Y", shaping.y))
             )
-        return tuple(
+        lines = [
             f"M593 {axis} F{s.f_hz:.6g} D{s.damping:.6g}".encode()
             for axis, s in (("X", shaping.x), ("Y", shaping.y))
-        )
+        ]
+        # A build that shapes X alone passes over the Y, and takes its line for X.
+        x_alone = self.stated is not None and not self.stated.y.f_hz
+        return tuple(lines[::-1] if x_alone else lines)
 
     def read_shaper(self, text: str, now: Shaping) -> Shaping:
         """Return the shaper in force after an M593 or M493."""

@@ -42,6 +42,7 @@ class MarlinStreamCommands:
     positioning_sets_extruder = True
     coarse_extruder = True
     relative_moves_count = True
+    replays = False
     one_command = True
     first_wins = False
     ignores_subcodes = True
@@ -86,9 +87,10 @@ class MarlinStreamCommands:
             return b""
         if s is None:
             return None
-        return (
-            f"M593 X F{s.freq_x_hz:g} D{s.damping_x:g}\nM593 Y F{s.freq_y_hz:g} D{s.damping_y:g}\n"
-        ).encode()
+        x = f"M593 X F{s.freq_x_hz:g} D{s.damping_x:g}\n"
+        y = f"M593 Y F{s.freq_y_hz:g} D{s.damping_y:g}\n"
+        # A build that shapes X alone passes over the Y, and takes its line for X.
+        return (x + y if s.freq_y_hz > 0.0 else y + x).encode()
 
     def shaped_axes(self, line: bytes) -> str:
         """Return those of X and Y that an M593 with F names, or both if it names none."""

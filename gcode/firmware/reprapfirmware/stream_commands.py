@@ -45,6 +45,7 @@ class RepRapStreamCommands:
     folds_case = True
     coarse_extruder = False
     relative_moves_count = False
+    replays = True
     one_command = False
     first_wins = True
     ignores_subcodes = False
