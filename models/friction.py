@@ -11,7 +11,8 @@ No command linear in the path can compensate for that; u = w + c s(w) does.
 
 Where an axis stands while the other moves, what still vibrates lets its guides creep until they are
 straight (Dahl's own model does so; a guide in a vibrating machine hardly rubs). So s decays within
-`CREEP_S`, and the command returns to the path.
+`CREEP_S`, and the command returns to the path. In very slow motion s is smaller for the same
+reason: half at `BEND_MM` / `CREEP_S`, 0.2 mm/s.
 """
 
 from __future__ import annotations

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from pydantic import ValidationError
@@ -30,6 +32,20 @@ def test_the_bend_follows_the_way_and_turns_over() -> None:
     assert bend_of(np.array([0.0, BEND_MM]))[-1] == pytest.approx(
         bend_of(np.linspace(0.0, BEND_MM, 50))[-1], abs=1e-12
     )
+
+
+def test_the_kernel_does_what_plain_python_does() -> None:
+    way = np.concatenate([WAYS[0, :400], np.full(200, WAYS[0, 399]), WAYS[1, :400]])
+    bend, expected = 0.0, [0.0]
+    for step in np.diff(way).tolist():
+        bend *= math.exp(-DT_S / CREEP_S)
+        bend = np.sign(step) + (bend - np.sign(step)) * math.exp(-abs(step) / BEND_MM)
+        expected.append(bend)
+    np.testing.assert_allclose(bend_of(way, DT_S), expected, atol=1e-12)
+
+
+def test_slow_motion_bends_guides_half_where_they_creep_as_fast() -> None:
+    assert bend_of(BEND_MM / CREEP_S * T_S, DT_S)[-1] == pytest.approx(0.5, abs=0.01)
 
 
 def test_a_command_that_makes_up_for_it_arrives() -> None:
