@@ -239,7 +239,7 @@ class Job:
         if self._changes:
             text = self._writer.end(self._sum.newline, self._checker.extruder_mm)
             self._motion.wait(switching_s(self._checker.push(text)))
-            self._emit(text)
+            self._count(self.retiming.end(text.lstrip(b"\n")))
         self._measurement.finish()
         if self._layers is not None:
             self._layers.finish(self._reader.feature_names)
@@ -255,10 +255,8 @@ class Job:
         if not self._changes:
             self._say("done", 1.0)
             return result
-        shortest_mm = 2.0 * self._adapter.shortest_move_mm
-        check = LastCheck(
-            Discarding(), self._source, self._machine, self._adapter.step_mm, shortest_mm
-        )
+        step_mm, shortest_mm = self._adapter.step_mm, 2.0 * self._adapter.shortest_move_mm
+        check = LastCheck(Discarding(), self._source, self._machine, step_mm, shortest_mm)
         self.deliver(check)
         figures = check.finish()
         self._say("done", 1.0)
@@ -471,12 +469,14 @@ class Job:
     def _emit(
         self, text: bytes, item: VerbatimPart | None = None, delay_s: float | np.ndarray = 0.0
     ) -> None:
-        self._sum.written += len(text)
-        most_mb = self._options.max_mb
-        if most_mb is not None and self._sum.written > 1e6 * most_mb:
-            raise TooLarge
+        self._count(len(text))
         self._target.write(text)
         self.retiming.push(text, item, delay_s)
+
+    def _count(self, size: int) -> None:
+        self._sum.written += size
+        if self._sum.written > 1e6 * (self._options.max_mb or float("inf")):
+            raise TooLarge
 
     def _say(self, stage: str, fraction: float) -> None:
         self._reports.say(stage, fraction, self._sum.time_s)

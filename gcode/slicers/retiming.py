@@ -85,6 +85,11 @@ class Retiming:
             self._note(text, item, np.broadcast_to(delay_s, (len(item.moves) + 1,)))
         self._size += len(text)
 
+    def end(self, lines: bytes) -> int:
+        """Insert more lines of ours behind the last command, before the tail; return their size."""
+        self._tail = lines + self._tail
+        return len(lines)
+
     def copy(self, source: BinaryIO, target: SupportsWrite[bytes], delay_s: float) -> int:
         """Copy the text, with the new times in it.
 
