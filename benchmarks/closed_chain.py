@@ -391,7 +391,9 @@ def compensated(
     # The report is about the whole file, the printer prints its beginning; friction is the same.
     part = nominal_um(parts, machine, task.seconds) / after.extruding.contour_rms_um
     rubbed_um = math.sqrt((after.contour_rubbing_um or high_um) ** 2 - high_um**2)
-    high_um = math.hypot(part * high_um, rubbed_um)
+    unsure_um = after.contour_friction_um or 0.0
+    plants_um = part * math.sqrt(high_um**2 - unsure_um**2)
+    high_um = math.hypot(plants_um, unsure_um, rubbed_um)
     return errors_of(parts, printer, task.seconds), (part * low_um, high_um)
 
 

@@ -57,12 +57,15 @@ class ErrorRange:
         Least and largest ratio of the members' error (delays included) to it.
     friction_um : float
         What friction that the measurement cannot show adds at most, in quadrature.
+    unsure_um : float
+        What the uncertainty of known friction adds at most, in quadrature.
     """
 
     reference_um: float
     low: float
     high: float
     friction_um: float = 0.0
+    unsure_um: float = 0.0
 
     def around_um(
         self, predicted_um: float, harder: float = 1.0, *, command_share: float = 1.0
@@ -70,7 +73,8 @@ class ErrorRange:
         """Return the range around the prediction for a print, without unseen friction.
 
         The error of a command differs between members; what whole motor steps or a coarse fit of
-        segments add to it hardly does.
+        segments add to it hardly does. What friction adds depends on where a path turns and hardly
+        on its speed: it is added as it was found on the reference motion.
 
         Parameters
         ----------
@@ -86,7 +90,7 @@ class ErrorRange:
         rounded_um = math.sqrt(predicted_um**2 - own_um**2)
         return (
             math.hypot(self.low * own_um, (1.0 - _STEPS_UNSURE) * rounded_um),
-            math.hypot(self.high * own_um, (1.0 + _STEPS_UNSURE) * rounded_um),
+            math.hypot(self.high * own_um, (1.0 + _STEPS_UNSURE) * rounded_um, self.unsure_um),
         )
 
     def mixed(self, other: ErrorRange, part: float) -> ErrorRange:
@@ -101,14 +105,14 @@ class ErrorRange:
     def applied_to(
         self, channel: Channel, harder: float = 1.0, *, command_share: float = 1.0
     ) -> Channel:
-        """Return a channel with its range, and with how far friction may exceed it.
-
-        What friction adds depends on where a path turns and hardly on its speed: it is added as it
-        was found on the reference motion.
-        """
+        """Return a channel with its range, and with how far friction may exceed it."""
         low_um, high_um = self.around_um(channel.judged_rms_um, harder, command_share=command_share)
         rubbing_um = math.hypot(high_um, self.friction_um) if self.friction_um else None
-        ranges = {"contour_range_um": (low_um, high_um), "contour_rubbing_um": rubbing_um}
+        ranges = {
+            "contour_range_um": (low_um, high_um),
+            "contour_friction_um": self.unsure_um,
+            "contour_rubbing_um": rubbing_um,
+        }
         return channel.model_copy(update=ranges)
 
 
@@ -125,7 +129,7 @@ def unseen_friction_mm(axis: PlantSetSpec) -> float:
 def nominal_response(machine: Machine, command: Array, dt_s: float) -> Array:
     """Return the nominal plants' response to a command, dry friction included."""
     pair = [plant_set(machine.axes[axis], dt_s).nominal for axis in ("x", "y")]
-    return response(pair, _received(machine, command, dt_s))
+    return response(pair, DryFriction(machine.friction_mm, dt_s).received_mm(command))
 
 
 def error_ranges(
@@ -141,34 +145,41 @@ def error_ranges(
     """
     x, y = (plant_set(machine.axes[axis], dt_s) for axis in ("x", "y"))
     pairs = side_by_side(x.members, y.members)
-    sides = np.where(np.arange(len(pairs)) % 2, 1.0, -1.0)
     # Sets without measured phase already include delays.
     lag_s = 0.0 if any(map(phase_unseen, machine.axes.values())) else _LAG_UNSURE_S
+    lags = np.where(np.arange(len(pairs)) % 2, 1.0, -1.0) * lag_s / dt_s
+    known_mm = np.array(machine.friction_mm)
     unseen_mm = [unseen_friction_mm(machine.axes[axis]) for axis in ("x", "y")]
-    out = {}
-    for name, command in commands.items():
-        nominal = max(rms(nominal_response(machine, command, dt_s)), 1e-12)
-        ratios = []
-        for pair, side in zip(pairs, sides, strict=True):
-            received = _received(machine, command, dt_s, side)
-            ratios.append(rms(_delayed(response(pair, received), side * lag_s / dt_s)) / nominal)
-        rubbed = nominal
-        if any(unseen_mm):
-            held = DryFriction(np.add(machine.friction_mm, unseen_mm).tolist(), dt_s)
-            rubbed = rms(response((x.nominal, y.nominal), held.received_mm(command)))
-        added = math.sqrt(max(0.0, rubbed**2 - nominal**2))
-        out[name] = ErrorRange(
-            1e3 * nominal, min(1.0, *ratios), max(1.0, *ratios), friction_um=1e3 * added
+    assumed = [machine.axes[axis].friction_assumed for axis in ("x", "y")]
+    unsure_mm = np.where(assumed, 1.0, _FRICTION_UNSURE) * known_mm
+
+    def range_of(command: Array) -> ErrorRange:
+        def rubbed(held_mm: Array, creep_s: float = dt_s) -> float:
+            received = DryFriction(held_mm.tolist(), creep_s).received_mm(command)
+            return rms(response((x.nominal, y.nominal), received))
+
+        received = DryFriction(known_mm.tolist(), dt_s).received_mm(command)
+        error = max(rms(response((x.nominal, y.nominal), received)), 1e-12)
+        errors = [
+            rms(_delayed(response(pair, received), lag))
+            for pair, lag in zip(pairs, lags, strict=True)
+        ]
+        less, more = rubbed(known_mm - unsure_mm), rubbed(known_mm + unsure_mm)
+        bent = rubbed(known_mm, 0.0)  # guides that do not creep
+        return ErrorRange(
+            1e3 * error,
+            min(error, less, *errors) / error,
+            max(error, *errors) / error,
+            friction_um=1e3 * _added(error, rubbed(known_mm + unseen_mm)),
+            unsure_um=1e3 * math.hypot(_added(error, max(less, more)), _added(error, bent)),
         )
-    return out
+
+    return {name: range_of(command) for name, command in commands.items()}
 
 
-def _received(machine: Machine, command: Array, dt_s: float, side: float = 0.0) -> Array:
-    """Return a command after dry friction, or the most or least of it (`side` 1 or -1)."""
-    axes = (machine.axes["x"], machine.axes["y"])
-    unsure = np.where([axis.friction_assumed for axis in axes], 1.0, _FRICTION_UNSURE)
-    held_mm = np.multiply(machine.friction_mm, 1.0 + side * unsure)
-    return DryFriction(held_mm.tolist(), dt_s).received_mm(command)
+def _added(error: float, rubbed: float) -> float:
+    """Return what makes this error that one, in quadrature."""
+    return math.sqrt(max(0.0, rubbed**2 - error**2))
 
 
 def _delayed(y: Array, samples: float) -> Array:

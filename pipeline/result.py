@@ -58,6 +58,9 @@ class Channel(_Figures):
     contour_range_um: tuple[float, float] | None = None
     """Least and largest contour error while extruding, root mean square, of all plants that explain
     the machine's measurement [um]; null for a machine without such a set."""
+    contour_friction_um: float | None = None
+    """Part of the upper end of that range, in quadrature: what guides that rub more, less or
+    otherwise than they were found to may add [um]; null without a range."""
     contour_rubbing_um: float | None = None
     """Upper end of the range if guides rub with 1.5 N per kg of moving mass, which resonance tables
     do not show [um]; null where friction was measured."""

@@ -5,18 +5,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from stillpath.compensation.friction import against_friction
 from stillpath.compensation.shapers import ShaperCompensator
 from stillpath.models.friction import with_least_friction
 from stillpath.models.machine import Machine
 from stillpath.models.plants import PlantSetSpec, RelativeMode, RelativeModesSpec, WeightedMember
 from stillpath.models.provenance import Provenance
-from stillpath.models.reference_motion import reference_motion_of
+from stillpath.models.reference_motion import reference_motion
 from stillpath.models.store import load_machine
-from stillpath.pipeline.error_range import error_ranges, unseen_friction_mm
+from stillpath.pipeline.error_range import error_ranges, nominal_response, unseen_friction_mm
 from stillpath.simulation.measures import PathDistances
 from stillpath.simulation.printers.bodies import STEP_S, Bodies, Element, Friction
 
 DT_S = 1e-3
+NO_RESTS = np.zeros((0, 2), np.int64)
 TABLE = Provenance(kind="spectrum")
 
 
@@ -65,20 +67,46 @@ def test_assumed_friction_is_part_of_what_is_unseen() -> None:
     assert PlantSetSpec.model_validate(soft.model_dump()) == soft
 
 
-def printer(f_hz: dict[str, float], force_n_kg: float) -> Bodies:
-    """One mass per axis on the spring of its belt, on guides that rub."""
+def printer(f_hz: dict[str, float], n_kg: float | dict[str, float]) -> Bodies:
+    """One mass per axis on the spring of its belt, on guides that rub with so many N per kg."""
     mass_kg, zeta = 0.4, 0.06
     elements, frictions = [], []
     for name, command in (("x", (1.0, 0.0)), ("y", (0.0, 1.0))):
         w = 2 * np.pi * f_hz[name]
         k_n_m, d_n_s_m = mass_kg * w**2, 2 * zeta * w * mass_kg
         elements.append(Element({name: 1.0}, k_n_m, d_n_s_m, command))
-        frictions.append(Friction({name: 1.0}, force_n_kg * mass_kg))
+        rubs_n_kg = n_kg[name] if isinstance(n_kg, dict) else n_kg
+        frictions.append(Friction({name: 1.0}, rubs_n_kg * mass_kg))
     return Bodies({"x": mass_kg, "y": mass_kg}, tuple(elements), tuple(frictions))
 
 
-def machine_of(f_hz: dict[str, float]) -> Machine:
-    axes = {name: axis(f) for name, f in f_hz.items()}
+def printed(bodies: Bodies, command_mm: np.ndarray) -> np.ndarray:
+    """Motion of a printer that executes a command, at the command's samples."""
+    fine, n = round(DT_S / STEP_S), command_mm.shape[1]
+    t = np.arange(n * fine - fine + 1) / fine
+    finely = np.stack([np.interp(t, np.arange(n), row) for row in command_mm])
+    return bodies.follow(finely, STEP_S).position_mm[:, ::fine]
+
+
+class Motion:
+    """The reference motion, and errors on it."""
+
+    def __init__(self, *limits: float) -> None:
+        self.path, self.extruding = reference_motion(DT_S, *limits)
+        self._distances = PathDistances(self.path, DT_S)
+        self._at = np.flatnonzero(self.extruding)[::5]
+
+    def shaped(self, machine: Machine, f_hz: dict[str, float]) -> np.ndarray:
+        """The command of the shaper MZV."""
+        shaper = ShaperCompensator(machine, DT_S, shaper="mzv", fx_hz=f_hz["x"], fy_hz=f_hz["y"])
+        return shaper.compensate(self.path, self.extruding, NO_RESTS)
+
+    def rms_mm(self, motion_mm: np.ndarray) -> float:
+        return float(np.sqrt(np.mean(self._distances.at(motion_mm[:, self._at], self._at) ** 2)))
+
+
+def machine_of(f_hz: dict[str, float], friction_mm: float | None = None) -> Machine:
+    axes = {name: axis(f, friction_mm=friction_mm) for name, f in f_hz.items()}
     return load_machine("generic-corexy").model_copy(update={"axes": axes})
 
 
@@ -88,23 +116,30 @@ def test_the_error_of_a_printer_that_rubs_is_within_the_range(f_hz: dict[str, fl
 
     With a shaper: friction also damps, and a command that makes an axis ring prints better by it.
     """
-    machine = machine_of(f_hz)
-    path, extruding = reference_motion_of(machine, DT_S)
-    distances, at = PathDistances(path, DT_S), np.flatnonzero(extruding)[::5]
-
-    def rms(motion: np.ndarray) -> float:
-        return float(np.sqrt(np.mean(distances.at(motion[:, at], at) ** 2)))
-
-    shaper = ShaperCompensator(machine, DT_S, shaper="mzv", fx_hz=f_hz["x"], fy_hz=f_hz["y"])
-    command = shaper.compensate(path, extruding, np.zeros((0, 2), np.int64))
-    known = error_ranges(machine, {"shaper": command}, rms, DT_S)["shaper"]
+    machine, motion = machine_of(f_hz), Motion()
+    command = motion.shaped(machine, f_hz)
+    known = error_ranges(machine, {"shaper": command}, motion.rms_mm, DT_S)["shaper"]
     most_um = np.hypot(known.high * known.reference_um, known.friction_um)
-    fine = round(DT_S / STEP_S)
-    t = np.arange(path.shape[1] * fine - fine + 1) / fine
-    finely = np.stack([np.interp(t, np.arange(path.shape[1]), row) for row in command])
     smooth_um, rubbing_um = (
-        1e3 * rms(printer(f_hz, force).follow(finely, STEP_S).position_mm[:, ::fine])
-        for force in (0.0, 1.2)
+        1e3 * motion.rms_mm(printed(printer(f_hz, force), command)) for force in (0.0, 1.2)
     )
     assert smooth_um == pytest.approx(known.reference_um, rel=0.02)
     assert 1.2 * smooth_um < rubbing_um < most_um
+
+
+def test_friction_that_was_found_too_small_counts_in_a_gentle_print_too() -> None:
+    """What it adds depends on where a path turns: it does not shrink with the accelerations."""
+    f_hz, held_mm = {"x": 60.0, "y": 45.0}, 0.004
+    machine = machine_of(f_hz, held_mm)
+    rubs = {name: 1.3 * 1e-3 * held_mm * (2 * np.pi * f) ** 2 for name, f in f_hz.items()}
+    hard, gentle = Motion(), Motion(40.0, 300.0)
+    commands = [
+        against_friction(motion.shaped(machine, f_hz), machine.friction_mm, NO_RESTS, DT_S)
+        for motion in (hard, gentle)
+    ]
+    known = error_ranges(machine, {"after": commands[0]}, hard.rms_mm, DT_S)["after"]
+    predicted_um = 1e3 * gentle.rms_mm(nominal_response(machine, commands[1], DT_S))
+    low_um, high_um = known.around_um(predicted_um)
+    true_um = 1e3 * gentle.rms_mm(printed(printer(f_hz, rubs), commands[1]))
+    assert low_um < true_um < high_um
+    assert true_um > 2.0 * known.high * predicted_um  # as much as plants alone would explain

@@ -39,7 +39,8 @@ def test_both_files_are_written_whole(result: Result, tmp_path: Path):
         "report.json",
     ]
     text = (tmp_path / "a" / "b" / "report.json").read_text().replace("null", '"nan"')
-    for name in ("contour_range_um", "contour_rubbing_um", "selected_rms_um"):
+    optional = ("contour_range_um", "contour_friction_um", "contour_rubbing_um", "selected_rms_um")
+    for name in optional:
         text = text.replace(f'"{name}":"nan"', f'"{name}":null')
     read = Result.model_validate(
         json.loads(text) | {"budget": None, "advice": None, "last_check": None}
