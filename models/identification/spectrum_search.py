@@ -34,6 +34,9 @@ _LEVEL, _LEVEL_SPREAD = np.log(0.92), 0.13
 stated (reference notes on identification); sensors read up to 15 % wrong."""
 _MISSTATED = 0.3
 """A plateau this far off (log) means other settings of the test: it is taken as the level."""
+_QUIETEST, _NOISIER = 10.0, 4.0
+"""Percentile of an undriven column's bins that shows the sensor's noise, and how many times as much
+power the driven one may have: Z of an ADXL345 hisses twice as much as X and Y (data sheet)."""
 _ZETA, _ZETA_SPREAD = 0.08, 0.5
 """Damping where a spectrum does not tell it, and the standard deviation of its logarithm."""
 _SHARE_SPREAD = 0.6
@@ -112,6 +115,7 @@ class Search:
         self._unit_hz = float(np.sqrt(model.f_hz[0] * model.f_hz[-1]))
         most = max(1, min(max_order, len(model.f_hz) // 12))
         self.orders = tuple(range(1, most + 1))
+        self._noise = _most_noise(repeats, column, model.band_hz)
         plateau = float(np.log(model.gain_of_plateau()))
         self._level = plateau if abs(plateau - _LEVEL) > _MISSTATED else float(_LEVEL)
 
@@ -223,9 +227,9 @@ class Search:
         model, structure, n = self.model, start.structure, start.structure.modes
         band_hz = (_MODES_BAND[0] * model.f_hz[0], _MODES_BAND[1] * model.f_hz[-1])
         low, high = structure.bounds(band_hz, _ZETA_BAND, _SHARE_BAND)
-        quiet = float(log_psd.min())
-        low = np.append([self._level - 0.6, quiet - 12.0], low)
-        high = np.append([self._level + 0.6, quiet + 0.5], high)
+        noise = min(float(log_psd.min()) + 0.5, self._noise)
+        low = np.append([self._level - 0.6, noise - 12.0], low)
+        high = np.append([self._level + 0.6, noise], high)
         unit = np.eye(len(low))
         zetas, shares = unit[2 + n : 2 + 2 * n], unit[2 + 2 * n :]
         # The last share is what the others leave.
@@ -276,3 +280,24 @@ class Search:
 def whitening_of(covariance: Array) -> Array:
     """Return the matrix that makes errors of this covariance independent with variance 1."""
     return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)), np.float64)
+
+
+def _most_noise(spectra: Sequence[Spectrum], column: str, band_hz: tuple[float, float]) -> float:
+    """Return the logarithm of the largest noise that the sensor's other columns allow.
+
+    Without this bound, white noise stands for whatever power a table has beyond the drive's at low
+    frequency. Then the level comes out too low, and with it all of |G| too high.
+
+    Returns
+    -------
+    float
+        Infinite where there are no other columns.
+    """
+    undriven = [
+        np.percentile(psd[(s.f_hz >= band_hz[0]) & (s.f_hz <= band_hz[1])], _QUIETEST)
+        for s in spectra
+        for name, psd in s.psd.items()
+        if name in ("x", "y", "z") and name != column
+    ]
+    heard = [psd for psd in undriven if psd > 0.0]
+    return float(np.log(_NOISIER * min(heard))) if heard else np.inf

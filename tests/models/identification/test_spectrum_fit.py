@@ -22,6 +22,7 @@ from stillpath.models.identification.spectrum_model import (
     driven_column,
     spectrum_model,
 )
+from stillpath.models.identification.spectrum_search import Search
 from stillpath.models.identification.synthetic import Sensor, simulate_spectrum
 from stillpath.models.identification.types import Excitation, Fit, Spectrum
 from stillpath.models.plants import (
@@ -224,3 +225,14 @@ def test_refit_keeps_the_structure() -> None:
     for mode, (f, zeta) in zip(member.modes, moved, strict=True):
         assert mode.f_hz == pytest.approx(f, rel=0.005)
         assert mode.zeta == pytest.approx(zeta, rel=0.15)
+
+
+def test_power_that_no_other_column_shows_is_no_noise_of_the_sensor() -> None:
+    """Real tables have more power than the drive explains, and other columns tell the noise."""
+    table = simulated(NARROW, (0.7, 0.3), LEGACY, noise=300.0)
+    noise = np.median(table.psd["z"])
+    psd = {**table.psd, "x": table.psd["x"] + 20.0 * noise}
+    for columns, times in ((psd, 4.0), ({"x": psd["x"]}, 40.0)):
+        search = Search(replace(table, psd=columns), "x", LEGACY, [replace(table, psd=columns)], 2)
+        found = np.exp(search.candidates(None)[0].vector[1])
+        assert 0.2 * times * noise < found < times * noise
