@@ -47,7 +47,7 @@ TABLES = {
 }
 _SOURCE = (
     "identified from resonance tables that its owner published (magnitude only: the phase was not "
-    "measured; slow motion is taken to have no delay, and the frame to stand firm): {}"
+    "measured; slow motion is taken to have no delay): {}"
 )
 
 
@@ -77,7 +77,7 @@ def main() -> int:
 def identified(base: Machine, tables: list[Path]) -> Machine:
     """Return the machine with the axes that the tables say."""
     files = [InputFile(path.name, path.read_bytes()) for path in tables]
-    found = identify_files(files, base, ReadSettings(frame_firm=True))
+    found = identify_files(files, base, ReadSettings())
     for axis, plants in sorted(found.machine.axes.items()):
         about = plants.provenance
         assert about is not None

@@ -88,7 +88,7 @@ def main() -> int:
         "--identified",
         action="store_true",
         help="machines as identify makes them of the same tables, in place of those that are "
-        "shipped (whose frames are taken to stand firm)",
+        "shipped (which have no friction)",
     )
     parser.add_argument("--tolerance-um", type=float, default=Options().tolerance_um)
     parser.add_argument("--shared", type=Path, help="default: $STILLPATH_SHARED or ../shared")
