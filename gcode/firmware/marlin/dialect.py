@@ -14,6 +14,7 @@ from stillpath.gcode.commands import (
     NO_ARCS,
     NO_RETRACTION,
     cancel_object,
+    cutter,
     home,
     host_command,
     retract,
@@ -114,8 +115,7 @@ STEPS: dict[str, Word] = {
     ),
     # The machine stops, waits, and continues from the same place. M114 stops in some builds only.
     **words(
-        "M3 M4 M5 M7 M8 M9 M10 M11 M12 M80 M109 M114 M190 M191 M192 M193 M240 M290 M293 M294 M303 "
-        "M400 M872",
+        "M7 M8 M9 M10 M11 M12 M80 M109 M114 M190 M191 M192 M193 M240 M290 M293 M294 M303 M400 M872",
         EventKind.STOP,
     ),
     # Homing, probing, parking, pauses, motors off, other files, tests: the place or the state is
@@ -142,6 +142,7 @@ STEPS: dict[str, Word] = {
         EventKind.UNKNOWN, "a part of the file repeats; it is read as if it were there once"
     ),
     "M92": commands.not_modelled(EventKind.HARMLESS, "steps per mm are taken from the machine"),
+    **words("M3 M4 M5", cutter(EventKind.STOP)),
     "M593": EventKind.SHAPER,
     # Fixed-time motion has a planner and shapers of its own.
     **words(
