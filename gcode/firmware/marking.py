@@ -93,7 +93,8 @@ def _behind_skipped(
     marks = np.append(_host_marks(verbatim), np.zeros(int(behind_mark), np.int64))
     if not len(marks):
         return
-    file_mm = _file_extruder(verbatim, LineReader(commands), extruder_mm)
+    reader = LineReader(commands)
+    file_mm = _file_extruder(verbatim, commands, reader, extruder_mm)
     for row in np.unique(marks[marks < len(moves)]).tolist():
         state = verbatim.modal[int(moves.modal_id[row])]
         if not state.absolute_e:
@@ -101,20 +102,39 @@ def _behind_skipped(
         lines = commands.limits(in_force(verbatim.limits[int(moves.limits_id[row])]))
         lines += b"G90\nM82\n" if state.absolute_xyz else b"G91\nM82\n"
         lines += b"" if np.isnan(file_mm[row]) else b"G92 E%.7f\n" % file_mm[row]
-        lines += feed_line(float(moves.speed_mm_s[row]) * 60.0 / state.speed_factor)
+        lines += _file_feed(verbatim, commands, reader, row)
         yield int(moves.byte_start[row]) - verbatim.text_offset, lines
 
 
+def _file_feed(
+    verbatim: VerbatimPart, commands: StreamCommands, reader: LineReader, row: int
+) -> bytes:
+    """Return the line that sets the F of the first move from a row on, if there is any.
+
+    G10 and G11 have speeds of their own, and leave F as it is.
+    """
+    moves = verbatim.moves
+    for k in range(row, len(moves)):
+        code = verbatim.line(moves, k).split(b";", 1)[0]
+        if reader.is_move(code):
+            alone = commands.factors_need_axes and not AXES.search(code)
+            factor = 1.0 if alone else verbatim.modal[int(moves.modal_id[k])].speed_factor
+            return feed_line(float(moves.speed_mm_s[k]) * 60.0 / factor)
+    return b""
+
+
 def _file_extruder(
-    verbatim: VerbatimPart, reader: LineReader, extruder_mm: float
+    verbatim: VerbatimPart, commands: StreamCommands, reader: LineReader, extruder_mm: float
 ) -> NDArray[np.float64]:
     """Return what the file takes for E before each move; NaN: that is not known (a bare G92)."""
     moves, events = verbatim.moves, verbatim.events
     fed_mm = np.zeros(len(moves))
     for row in np.flatnonzero(moves.end_mm[:, 3] != moves.start_mm[:, 3]).tolist():
-        # G10 and G11 leave E as it is.
-        if reader.extruder_word(verbatim.line(moves, row).split(b";", 1)[0]) is not None:
-            factor = verbatim.modal[int(moves.modal_id[row])].extrude_factor
+        code = verbatim.line(moves, row).split(b";", 1)[0]
+        # G10 and G11 leave E as it is, whatever words they have.
+        if reader.is_move(code) and reader.extruder_word(code) is not None:
+            alone = commands.factors_need_axes and not AXES.search(code)
+            factor = 1.0 if alone else verbatim.modal[int(moves.modal_id[row])].extrude_factor
             fed_mm[row] = (moves.end_mm[row, 3] - moves.start_mm[row, 3]) / factor
     counted_mm = np.append(0.0, np.cumsum(fed_mm)[:-1])
     file_mm = extruder_mm + counted_mm
