@@ -91,14 +91,15 @@ def _behind_skipped(
     """
     moves = verbatim.moves
     marks = np.append(_host_marks(verbatim), np.zeros(int(behind_mark), np.int64))
-    if not len(marks):
+    absolute = np.array([state.absolute_e for state in verbatim.modal], bool)
+    rows = np.unique(marks[marks < len(moves)])
+    rows = rows[absolute[moves.modal_id[rows]]]
+    if not len(rows):
         return
     reader = LineReader(commands)
     file_mm = _file_extruder(verbatim, commands, reader, extruder_mm)
-    for row in np.unique(marks[marks < len(moves)]).tolist():
+    for row in rows.tolist():
         state = verbatim.modal[int(moves.modal_id[row])]
-        if not state.absolute_e:
-            continue
         lines = commands.limits(in_force(verbatim.limits[int(moves.limits_id[row])]))
         lines += b"G90\nM82\n" if state.absolute_xyz else b"G91\nM82\n"
         lines += b"" if np.isnan(file_mm[row]) else b"G92 E%.7f\n" % file_mm[row]
