@@ -395,6 +395,8 @@ CLASSES = {
     "M900 K0.05 T1": {"marlin": EventKind.HARMLESS},
     "M221 S90 T1": {"marlin": EventKind.HARMLESS},
     "M7": {"marlin": EventKind.STOP},
+    "M102": {"marlin": EventKind.HARMLESS},  # Simplify3D's, beside M101 and M103
+    "M102 S-6": {"marlin": EventKind.UNKNOWN},
     "G28.5": {"marlin": EventKind.UNKNOWN},
     "M1234": {
         "marlin": EventKind.HARMLESS,

@@ -133,11 +133,12 @@ STEPS: dict[str, Word] = {
     ),
     # The coordinates count from somewhere else.
     **words(
-        "G92.2 G92.3 G92.4 G92.5 G92.6 G92.7 G92.8 G92.9 M102 M206 M218 M350 M351 M416 M428 M665 "
+        "G92.2 G92.3 G92.4 G92.5 G92.6 G92.7 G92.8 G92.9 M206 M218 M350 M351 M416 M428 M665 "
         "M666 M810 M811 M812 M813 M814 M815 M816 M817 M818 M819 M820 M852",
         _MOVED,
     ),
     **words("M501 M502", commands.reset_limits),
+    "M102": commands.bed_distance_sensor,
     "M808": commands.not_modelled(
         EventKind.UNKNOWN, "a part of the file repeats; it is read as if it were there once"
     ),
