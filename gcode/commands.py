@@ -7,12 +7,22 @@ from itertools import takewhile
 
 from stillpath.gcode import _slots as at
 from stillpath.gcode.comments import note_object
-from stillpath.gcode.dialect import Word
+from stillpath.gcode.dialect import Handler, Word
 from stillpath.gcode.lexer import Command
 from stillpath.gcode.state import MachineState
 from stillpath.gcode.types import EventKind
 
-__all__ = ["NO_ARCS", "NO_RETRACTION", "cancel_object", "home", "host_command", "retract", "tool"]
+__all__ = [
+    "NO_ARCS",
+    "NO_RETRACTION",
+    "cancel_object",
+    "cutter",
+    "hold_laser",
+    "home",
+    "host_command",
+    "retract",
+    "tool",
+]
 
 _OBJECT = re.compile(r"\s*@object(info|stop)?\b([^;]*)", re.IGNORECASE)
 """Marks that the plugin Cancel Objects puts in place of slicers' comments."""
@@ -117,6 +127,32 @@ def host_command(state: MachineState, command: Command) -> int:
     if found[1] is not None and found[1].lower() == "info":
         return state.event(EventKind.HARMLESS)
     return note_object(state, command, "" if found[1] else found[2].strip())
+
+
+def cutter(kind: EventKind) -> Handler:
+    """Return a handler of M3, M4 and M5: a spindle or a laser on, and off.
+
+    Where moves set a laser's power (with S, after Marlin's I, in RepRapFirmware's M452), G0
+    switches it off and G1 leaves it on. A stream has G1 alone, and stands still at its ends. So
+    nothing is replaced until M5 (Marlin src/gcode/gcode.cpp, get_destination_from_command,
+    2.1.x; RepRapFirmware GCodes.cpp, DoStraightMove, 3.6.0-beta.1).
+    """
+
+    def handle(state: MachineState, command: Command) -> int:
+        state.cutter_on = state.laser_mode or command.name != "M5"
+        if command.name == "M5":
+            state.hold("laser", False)
+        elif state.laser_mode or "I" in command.words:
+            hold_laser(state)
+        return state.event(kind)
+
+    return handle
+
+
+def hold_laser(state: MachineState) -> None:
+    """Let moves stay as they are until the laser is off."""
+    state.warn("from here on a laser's moves stay as they are, with the travel between them")
+    state.hold("laser", True)
 
 
 def tool(state: MachineState, command: Command) -> int:

@@ -8,7 +8,7 @@ from stillpath.gcode import _slots as at
 from stillpath.gcode.lexer import Command
 from stillpath.gcode.slicers.marks import MarkKind, read_mark
 from stillpath.gcode.state import MachineState
-from stillpath.gcode.types import KEPT, EventKind
+from stillpath.gcode.types import EventKind
 
 __all__ = ["note_comment", "note_object"]
 
@@ -26,8 +26,7 @@ def note_comment(state: MachineState, command: Command) -> int:
         state.remember(command, at.MEMO_EVENT, int(EventKind.STAMP))
         return state.event(EventKind.STAMP)
     elif kind in (MarkKind.OFF, MarkKind.ON):
-        state.settle()
-        i[at.I_KEPT] = KEPT if kind == MarkKind.OFF or state.tunes else 0
+        state.hold("mark", kind == MarkKind.OFF)
     elif kind == MarkKind.LAYER:
         _note_layer(state, command, text[found : found + 7], mark.text)
     elif kind == MarkKind.Z:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from stillpath.gcode import _slots as at
 from stillpath.gcode._command_kernels import execute
 from stillpath.gcode._lex_kernels import PADDING, run
+from stillpath.gcode.commands import hold_laser
 from stillpath.gcode.comments import note_comment
 from stillpath.gcode.dialect import Action, Dialect
 from stillpath.gcode.errors import GcodeError
@@ -368,6 +369,8 @@ class Interpreter:
         more = further_words(command) if Action.MOVE <= action <= Action.ARC_CCW else ""
         if more:
             state.warn(f"moves of other axes, extruders or lasers ({more}) stay as sliced")
+            if state.cutter_on and "S" in more:
+                hold_laser(state)
             return self._as_it_is(action, mask)
         return execute(int(action), state.w, mask, state.f, state.i, state.rows, state.tables)
 

@@ -30,7 +30,7 @@ from stillpath.gcode._table_kernels import (
 from stillpath.gcode.dialect import Dialect, OriginRule
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.lexer import Command, extended_parameters
-from stillpath.gcode.types import OF_STATE, EventKind, Limits
+from stillpath.gcode.types import KEPT, OF_STATE, EventKind, Limits
 from stillpath.models.firmware import FirmwareFacts, FirmwareRetraction, Marlin, RepRapFirmware
 from stillpath.models.machine import Machine
 
@@ -84,6 +84,12 @@ class MachineState:
         number) and ends in it.
     carry_out : function
         Carries out another command of the same line (the interpreter's).
+    held : dict of str to bool
+        Why moves stay as they are (`hold`).
+    laser_mode : bool
+        The machine is one with a laser (M452).
+    cutter_on : bool
+        A spindle or laser is on (M3, M4), or may be at any move (`laser_mode`).
     warnings : dict of str to int
         What the firmware skips or what is unknown, with the line of first occurrence.
     """
@@ -107,8 +113,8 @@ class MachineState:
         self.factors: dict[str, float] = {}
         self.macro_ran = False
         """The file has called what may be a macro of the printer."""
-        self.tunes = False
-        """TUNING_TOWER has begun: no mark puts moves into streams again."""
+        self.held: dict[str, bool] = {}
+        self.laser_mode = self.cutter_on = False
         self.tool_known = dialect.tool_at_start
         self.conditional_indent = -1
         self.warnings: dict[str, int] = {}
@@ -177,6 +183,12 @@ class MachineState:
         self.i[at.I_KNOWN] &= ~axes
         if origin:
             self.i[at.I_ORIGIN_KNOWN] &= ~axes
+
+    def hold(self, reason: str, on: bool) -> None:
+        """Let moves stay as they are for a reason, or no longer for this one."""
+        self.settle()
+        self.held[reason] = on
+        self.i[at.I_KEPT] = KEPT if any(self.held.values()) else 0
 
     def travel(self) -> int:
         """Go to F_LAST for a line that does more than move, and must stay."""

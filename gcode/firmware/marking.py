@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterator
 
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillpath.gcode.firmware.base import StreamCommands
-from stillpath.gcode.firmware.line_reader import SET_POSITION
+from stillpath.gcode.firmware.line_reader import AXES, SET_POSITION, LineReader
 from stillpath.gcode.firmware.modes import feed_line
 from stillpath.gcode.pieces import VerbatimPart
 from stillpath.gcode.types import EventKind, Limits
@@ -88,22 +89,65 @@ def _behind_skipped(
     OctoPrint's Cancel Objects sends no line of an object, the end of a stream included, and then a
     G92 E by the absolute E that it has read; but a stream has relative E.
     """
-    moves, events = verbatim.moves, verbatim.events
+    moves = verbatim.moves
     marks = np.append(_host_marks(verbatim), np.zeros(int(behind_mark), np.int64))
-    if not len(marks):
+    absolute = np.array([state.absolute_e for state in verbatim.modal], bool)
+    rows = np.unique(marks[marks < len(moves)])
+    rows = rows[absolute[moves.modal_id[rows]]]
+    if not len(rows):
         return
-    sets = [row for row in range(len(events)) if SET_POSITION.match(verbatim.line(events, row))]
-    known = int(events.move_index[sets[0]]) if sets else len(moves) - 1
-    for row in np.unique(marks[(marks <= known) & (marks < len(moves))]).tolist():
+    reader = LineReader(commands)
+    file_mm = _file_extruder(verbatim, commands, reader, extruder_mm)
+    for row in rows.tolist():
         state = verbatim.modal[int(moves.modal_id[row])]
-        if not state.absolute_e:
-            continue
-        fed_mm = float(moves.start_mm[row, 3] - moves.start_mm[0, 3])
         lines = commands.limits(in_force(verbatim.limits[int(moves.limits_id[row])]))
         lines += b"G90\nM82\n" if state.absolute_xyz else b"G91\nM82\n"
-        lines += b"G92 E%.7f\n" % (extruder_mm + fed_mm / state.extrude_factor)
-        lines += feed_line(float(moves.speed_mm_s[row]) * 60.0 / state.speed_factor)
+        lines += b"" if np.isnan(file_mm[row]) else b"G92 E%.7f\n" % file_mm[row]
+        lines += _file_feed(verbatim, commands, reader, row)
         yield int(moves.byte_start[row]) - verbatim.text_offset, lines
+
+
+def _file_feed(
+    verbatim: VerbatimPart, commands: StreamCommands, reader: LineReader, row: int
+) -> bytes:
+    """Return the line that sets the F of the first move from a row on, if there is any.
+
+    G10 and G11 have speeds of their own, and leave F as it is.
+    """
+    moves = verbatim.moves
+    for k in range(row, len(moves)):
+        code = verbatim.line(moves, k).split(b";", 1)[0]
+        if reader.is_move(code):
+            alone = commands.factors_need_axes and not AXES.search(code)
+            factor = 1.0 if alone else verbatim.modal[int(moves.modal_id[k])].speed_factor
+            return feed_line(float(moves.speed_mm_s[k]) * 60.0 / factor)
+    return b""
+
+
+def _file_extruder(
+    verbatim: VerbatimPart, commands: StreamCommands, reader: LineReader, extruder_mm: float
+) -> NDArray[np.float64]:
+    """Return what the file takes for E before each move; NaN: that is not known (a bare G92)."""
+    moves, events = verbatim.moves, verbatim.events
+    fed_mm = np.zeros(len(moves))
+    for row in np.flatnonzero(moves.end_mm[:, 3] != moves.start_mm[:, 3]).tolist():
+        code = verbatim.line(moves, row).split(b";", 1)[0]
+        # G10 and G11 leave E as it is, whatever words they have.
+        if reader.is_move(code) and reader.extruder_word(code) is not None:
+            alone = commands.factors_need_axes and not AXES.search(code)
+            factor = 1.0 if alone else verbatim.modal[int(moves.modal_id[row])].extrude_factor
+            fed_mm[row] = (moves.end_mm[row, 3] - moves.start_mm[row, 3]) / factor
+    counted_mm = np.append(0.0, np.cumsum(fed_mm)[:-1])
+    file_mm = extruder_mm + counted_mm
+    end = len(moves)
+    for event in reversed(range(len(events))):
+        code = verbatim.line(events, event).split(b";", 1)[0]
+        word, row = reader.extruder_word(code), int(events.move_index[event])
+        if row < end and SET_POSITION.match(code) and (word is not None or not AXES.search(code)):
+            set_mm = math.nan if word is None else word
+            file_mm[row:end] = set_mm + counted_mm[row:end] - counted_mm[row]
+            end = row
+    return file_mm
 
 
 def _host_marks(verbatim: VerbatimPart) -> NDArray[np.int64]:

@@ -85,6 +85,8 @@ _PATTERNS: tuple[tuple[re.Pattern[str], MarkKind], ...] = tuple(
         (r"; feature (?P<text>.*)$", MarkKind.FEATURE),  # Kiri:Moto, Simplify3D
         (r"; printing object (?P<text>.*)$", MarkKind.OBJECT),
         (r"; stop printing object", MarkKind.OBJECT),
+        # Simplify3D has one process for each object, if they are to be excluded one by one.
+        (r"; process (?P<text>\S.*)$", MarkKind.OBJECT),
         (r";MESH:NONMESH\s*$", MarkKind.OBJECT),
         (r";MESH:(?P<text>.*)$", MarkKind.OBJECT),
         (r";PRINTING:(?P<text>.*)$", MarkKind.OBJECT),  # ideaMaker

@@ -12,7 +12,7 @@ import pytest
 
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.interpreter import Interpreter
-from stillpath.gcode.types import EventKind, ProgramBlock
+from stillpath.gcode.types import KEPT, EventKind, ProgramBlock
 from stillpath.models.firmware import FirmwareFacts, Klipper, Marlin, RepRapFirmware
 from stillpath.models.machine import Machine
 
@@ -395,6 +395,8 @@ CLASSES = {
     "M900 K0.05 T1": {"marlin": EventKind.HARMLESS},
     "M221 S90 T1": {"marlin": EventKind.HARMLESS},
     "M7": {"marlin": EventKind.STOP},
+    "M102": {"marlin": EventKind.HARMLESS},  # Simplify3D's, beside M101 and M103
+    "M102 S-6": {"marlin": EventKind.UNKNOWN},
     "G28.5": {"marlin": EventKind.UNKNOWN},
     "M1234": {
         "marlin": EventKind.HARMLESS,
@@ -613,3 +615,38 @@ def test_numbers_of_all_kinds_are_numbers(read) -> None:
     assert read("M83\nG1 X1e1 E1 F600\n", "reprapfirmware")[1].warnings == []
     of_two = "line 2: moves of other axes, extruders or lasers (E) stay as sliced"
     assert read("M83\nG1 X1e1 E1:2 F600\n", "reprapfirmware")[1].warnings == [of_two]
+
+
+_BURNS = "G1 X110 S200 F1200\nG1 Y110\nG0 X140 F6000\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "on", "stays"),
+    [
+        ("marlin", "M4 I\n", True),
+        ("marlin", "M3 S0\n", True),
+        ("marlin", "", False),  # G1 S of an old start script: no laser
+        ("reprapfirmware", "M3 S0\n", True),
+        ("reprapfirmware", "M452\n", True),
+        ("klipper", "M3 S0\n", False),  # G0 is G1 there, whatever a macro M3 does
+    ],
+)
+def test_travel_of_a_laser_stays(read, name: str, on: str, stays: bool) -> None:
+    """G0 switches it off, which a stream's G1 does not: it would burn its way to the next line."""
+    block, interpreter = read(f"G28\nG1 X1 Y1 F600\n{on}{_BURNS}", name)
+    assert (block.moves.known & KEPT > 0).tolist() == [False, True, stays, stays]
+    assert any("a laser's moves" in text for text in interpreter.warnings) == stays
+
+
+def test_behind_a_laser_moves_are_moves_again(read) -> None:
+    for on, off in (("M3 S0", "M5"), ("M3 I", "M5"), ("M452", "M451")):
+        name = "reprapfirmware" if on == "M452" else "marlin"
+        text = f"G1 X1 Y1 F600\n{on}\n{_BURNS}{off}\nG0 X3\nM3 S90\nG1 X5\n"
+        block, _ = read(text, name)
+        assert not np.any(block.moves.known[-2:] & KEPT)
+    # M5 in laser mode: the next move may have a power again.
+    block, _ = read(f"G1 X1 Y1 F600\nM452\nM5\n{_BURNS}", "reprapfirmware")
+    assert (block.moves.known[1:] & KEPT > 0).all()
+    # A user's mark outlasts M5.
+    block, _ = read("G1 X1 Y1 F600\n; STILLPATH_OFF\nM3 I\nM5\nG0 X3\n", "marlin")
+    assert block.moves.known[-1] & KEPT

@@ -105,6 +105,7 @@ MARKS_OF_ALL = [
     ("; printing object a id:0 copy 0", "; printing object b id:0 copy 0"),
     (";MESH:a", ";MESH:b"),
     (";PRINTING: a", ";PRINTING: b"),
+    ("; process a", "; process b"),
     ("@Object a id:0 copy 0", "@Object b id:0 copy 0"),  # OctoPrint's Cancel Objects
     ("M486 S0\n; printing object a", "M486 S-1\n; stop printing object a\nM486 S1"),
 ]

@@ -188,3 +188,33 @@ def test_behind_m200_no_line_of_ours_counts_in_millimetres(tmp_path: Path, cache
     _, written = compensated(text + sliced, tmp_path, cache, ender3_with("marlin"))
     assert b"; stillpath: stream off" in written
     assert sliced in written
+
+
+@pytest.mark.parametrize("kind", ["klipper", *KINDS])
+@pytest.mark.parametrize(
+    ("before", "behind"),
+    [
+        ("", "G92 E0\nG1 E-1 F1800\n"),  # Simplify3D
+        ("", "G1 E2.5 F1800\nG92 E0.5\nG92 X{x} Y50\n;MESH:NONMESH\nG1 E-.5\n;MESH:{name}\n"),
+        ("G10\n", "G1 Z6 F600\nG1 Z5 F600\nG11\nG92 E0\n"),  # Cura, with the firmware's retraction
+        ("", "G92 E0\nG10\nG1 Z6\nG1 Z5\nG11\nG1 E-1\n;MESH:NONMESH\nG1 Z6\nG1 Z5\n;MESH:{name}\n"),
+    ],
+)
+def test_absolute_filament_behind_an_objects_mark(
+    kind: str, before: str, behind: str, tmp_path: Path, cache: Path
+) -> None:
+    """A G92 of the file counts there, and G10 does not, for it leaves E and F as they are."""
+    machine = ender3_with(kind)
+    draws = load_machine("ender3").firmware.retraction
+    firmware = machine.firmware.model_copy(update={"retraction": draws})
+    machine = machine.model_copy(update={"firmware": firmware})
+    text = "G28\nG90\nM82\nM220 S80\nM221 S90\nG1 X50 Y50 Z5 F3000\n"
+    for name, x in (("a", 60), ("b", 90), ("a", 60)):
+        text += before + f";MESH:{name}\n" + behind.format(name=name, x=x - 20)
+        text += f"G1 X{x} Y50 F6000\nG1 X{x + 20} E1 F3000\nG1 Y70 E2\nG1 X{x} Y55 E3\n"
+        text += f"G1 X{x - 20} Y50 F6000\n"
+    data = tagged(text.encode())
+    result, written = compensated(data, tmp_path, cache, machine)
+    assert result.put_back == []
+    assert written.count(b"; stillpath: stream on") >= 3
+    assert differences(data, written, machine) == []

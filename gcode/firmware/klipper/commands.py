@@ -13,7 +13,7 @@ import numpy as np
 from stillpath.gcode import _slots as at
 from stillpath.gcode.lexer import Command
 from stillpath.gcode.state import MachineState, Saved
-from stillpath.gcode.types import KEPT, EventKind
+from stillpath.gcode.types import EventKind
 
 __all__ = [
     "acceleration",
@@ -202,9 +202,7 @@ def tuning_tower(state: MachineState, _command: Command) -> int:
         "TUNING_TOWER changes a setting at every height; what follows stays as sliced, so that it "
         "is that setting which is tested"
     )
-    state.settle()
-    state.i[at.I_KEPT] = KEPT
-    state.tunes = True
+    state.hold("TUNING_TOWER", True)
     return state.event(EventKind.UNKNOWN)
 
 

@@ -20,6 +20,7 @@ from stillpath.models.firmware import Marlin
 __all__ = [
     "accelerations",
     "axis_limits",
+    "bed_distance_sensor",
     "corners_and_least_speeds",
     "end_motion_mode",
     "extrude_factor",
@@ -241,6 +242,19 @@ def resonance_test(state: MachineState, command: Command) -> int:
         return state.event(EventKind.HARMLESS)
     state.warn("M495 S: a resonance test moves an axis, also while the next lines run")
     state.forget(origin=False)
+    return state.event(EventKind.UNKNOWN)
+
+
+def bed_distance_sensor(state: MachineState, command: Command) -> int:
+    """M102: with S it adjusts Z by the sensor, or calibrates; else it reports, if it is known.
+
+    Simplify3D writes it alone, with its M101 and M103 (Marlin/src/gcode/probe/M102.cpp,
+    bugfix-2.1.x).
+    """
+    if not state.numbers(command, "S"):
+        return state.event(EventKind.HARMLESS)
+    state.warn("M102: from here on the position is not known until the printer homes")
+    state.forget(origin=True)
     return state.event(EventKind.UNKNOWN)
 
 

@@ -14,6 +14,7 @@ from stillpath.gcode.commands import (
     NO_ARCS,
     NO_RETRACTION,
     cancel_object,
+    cutter,
     home,
     host_command,
     retract,
@@ -114,8 +115,7 @@ STEPS: dict[str, Word] = {
     ),
     # The machine stops, waits, and continues from the same place. M114 stops in some builds only.
     **words(
-        "M3 M4 M5 M7 M8 M9 M10 M11 M12 M80 M109 M114 M190 M191 M192 M193 M240 M290 M293 M294 M303 "
-        "M400 M872",
+        "M7 M8 M9 M10 M11 M12 M80 M109 M114 M190 M191 M192 M193 M240 M290 M293 M294 M303 M400 M872",
         EventKind.STOP,
     ),
     # Homing, probing, parking, pauses, motors off, other files, tests: the place or the state is
@@ -133,15 +133,17 @@ STEPS: dict[str, Word] = {
     ),
     # The coordinates count from somewhere else.
     **words(
-        "G92.2 G92.3 G92.4 G92.5 G92.6 G92.7 G92.8 G92.9 M102 M206 M218 M350 M351 M416 M428 M665 "
+        "G92.2 G92.3 G92.4 G92.5 G92.6 G92.7 G92.8 G92.9 M206 M218 M350 M351 M416 M428 M665 "
         "M666 M810 M811 M812 M813 M814 M815 M816 M817 M818 M819 M820 M852",
         _MOVED,
     ),
     **words("M501 M502", commands.reset_limits),
+    "M102": commands.bed_distance_sensor,
     "M808": commands.not_modelled(
         EventKind.UNKNOWN, "a part of the file repeats; it is read as if it were there once"
     ),
     "M92": commands.not_modelled(EventKind.HARMLESS, "steps per mm are taken from the machine"),
+    **words("M3 M4 M5", cutter(EventKind.STOP)),
     "M593": EventKind.SHAPER,
     # Fixed-time motion has a planner and shapers of its own.
     **words(

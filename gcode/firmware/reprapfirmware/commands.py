@@ -260,6 +260,8 @@ def machine_mode(state: MachineState, command: Command) -> int:
         paren_comments=command.name == "M453",
     )
     state.dialect.set_rules(state.i)
+    state.laser_mode = state.cutter_on = command.name == "M452"
+    state.hold("laser", False)
     return state.event(EventKind.STOP)
 
 

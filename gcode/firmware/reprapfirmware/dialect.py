@@ -5,7 +5,7 @@ Sources: docs/dialects.md, which also says what was not read in the firmware's o
 
 from __future__ import annotations
 
-from stillpath.gcode.commands import NO_ARCS, cancel_object, home, host_command, retract
+from stillpath.gcode.commands import NO_ARCS, cancel_object, cutter, home, host_command, retract
 from stillpath.gcode.dialect import (
     Action,
     ArcRule,
@@ -78,7 +78,7 @@ LIMITS: dict[str, Word] = {
 STEPS: dict[str, Word] = {
     # Temperatures, fans, messages, settings: the motion does not notice.
     **words(
-        "G31 M3 M4 M20 M21 M22 M27 M29 M30 M36 M36.1 M38 M39 M42 M73 M80 M85 M102 M104 M105 M106 "
+        "G31 M20 M21 M22 M27 M29 M30 M36 M36.1 M38 M39 M42 M73 M80 M85 M102 M104 M105 M106 "
         "M107 M108 M110 M111 M114 M115 M117 M118 M119 M122 M140 M141 M143 M144 M201.1 M202 M260 "
         "M261 M280 M292 M300 M301 M304 M305 M307 M308 M309 M374 M404 M407 M408 M409 M450 M470 M471 "
         "M472 M500 M503 M540 M550 M551 M552 M553 M554 M555 M557 M558 M564 M568 M570 M571 M573 M575 "
@@ -88,9 +88,11 @@ STEPS: dict[str, Word] = {
     ),
     # Come to rest, wait, go on from the same place.
     **words(
-        "M5 M17 M116 M150 M190 M191 M290 M302 M303 M400 M577 M578 M595 M598 M906 M913 M917 M918",
+        "M17 M116 M150 M190 M191 M290 M302 M303 M400 M577 M578 M595 M598 M906 M913 M917 M918",
         EventKind.STOP,
     ),
+    **words("M3 M4", cutter(EventKind.HARMLESS)),
+    "M5": cutter(EventKind.STOP),
     "M109": commands.heat_and_wait,
     # Homing, probing, macros, pauses, motors off, other files and queues, events: the place or the
     # state is lost.

@@ -29,6 +29,7 @@ K = MarkKind
         (";TYPE:External perimeter", K.FEATURE, "External perimeter"),
         ("; printing object a b.stl id:0 copy 0", K.OBJECT, "a b.stl id:0 copy 0"),
         ("; stop printing object a b.stl id:0 copy 0", K.OBJECT, ""),
+        ("; process Process1", K.OBJECT, "Process1"),  # Simplify3D
         (";WIPE_START", K.WIPE_START, ""),
         (";WIPE_END", K.WIPE_END, ""),
         (";COLOR_CHANGE,T0,#FF0000", K.COLOR_CHANGE, ""),
