@@ -14,7 +14,7 @@ from stillpath.models.identification.estimation import plateau_gain
 from stillpath.models.identification.nozzle import Frame
 from stillpath.models.identification.readers.checks import RANGE_ENDED
 from stillpath.models.identification.types import Excitation, Fit, FrequencyResponse, Spectrum
-from stillpath.models.plants import PlantSetSpec, RelativeModesSpec
+from stillpath.models.plants import PairsSpec, PlantSetSpec, PlantSpec, RelativeModesSpec
 
 __all__ = [
     "apart_warning",
@@ -102,18 +102,25 @@ def friction_notes(plants: PlantSetSpec) -> list[str]:
     return [note]
 
 
-def frame_mode_notes(felt: RelativeModesSpec, kept: RelativeModesSpec) -> list[str]:
-    """Say which modes of a table are left out as the frame's."""
-    known_hz = {mode.f_hz for mode in kept.modes}
-    left_out = [f"{mode.f_hz:.1f} Hz" for mode in felt.modes if mode.f_hz not in known_hz]
+def frame_mode_notes(felt: PlantSpec, kept: PlantSpec, *, table: bool = False) -> list[str]:
+    """Say which modes of a log, or of a table, are left out as the frame's."""
+    known_hz = _modes_hz(kept)
+    left_out = [f"{f_hz:.1f} Hz" for f_hz in _modes_hz(felt) if f_hz not in known_hz]
     if not left_out:
         return []
+    better = "; raw logs would tell" if table else ""
     note = (
         f"what shakes weakly at {' and '.join(left_out)}, far below the strongest resonance, is "
-        "taken to be the frame on its feet: the sensor feels it, the nozzle over the bed does not "
-        "(frame_firm leaves it in; raw logs would tell)"
+        "taken to be the frame on its feet, or what it stands on: the sensor feels it, the nozzle "
+        f"over the bed does not (frame_firm leaves it in{better})"
     )
     return [note]
+
+
+def _modes_hz(plant: PlantSpec) -> list[float]:
+    if isinstance(plant, RelativeModesSpec):
+        return [mode.f_hz for mode in plant.modes]
+    return [pole.f_hz for pole in plant.poles] if isinstance(plant, PairsSpec) else []
 
 
 def no_frame_note(frames_hz: Mapping[Literal["x", "y"], float | None]) -> str:

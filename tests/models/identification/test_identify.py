@@ -38,6 +38,7 @@ from stillpath.models.plants import (
     PolePair,
     RelativeMode,
     RelativeModesSpec,
+    ZeroPair,
     frequency_response,
 )
 from stillpath.models.schedule import AxisSchedule, MassSchedule
@@ -648,3 +649,23 @@ def test_modes_whose_slow_motion_is_early_count_as_the_plant_they_are_used_as() 
     used = fit.gain * np.abs(frequency_response(prompt(fit), f_hz))
     missed = np.linalg.norm(used - np.abs(g)) / np.linalg.norm(g)
     assert missed < 0.025
+
+
+@pytest.mark.slow
+def test_a_table_that_rocks_under_a_frame_that_shakes() -> None:
+    """Only one of the two is found as the frame; the other one is no more the nozzle's."""
+    poles, zeros = [PolePair(f_hz=42.0, zeta=0.06)], []
+    for f_hz, mass_ratio in ((9.0, 0.05), (21.0, 0.08)):
+        poles.append(PolePair(f_hz=f_hz, zeta=0.08))
+        zeros.append(ZeroPair(f_hz=f_hz * (1 + 0.5 * mass_ratio), zeta=0.08 * (1 + mass_ratio)))
+    felt = PairsSpec(poles=tuple(poles), zeros=tuple(zeros))
+    test = replace(QUICK, f_end_hz=90.0)
+    settings = ReadSettings.model_validate({**QUICK_SETTINGS, "f_end_hz": 90.0})
+    found = one(raw_file(quick_log(plant=felt, test=test)), settings=settings)
+    assert any("the frame shakes on its feet" in note for note in found.notes)
+    assert any("or what it stands on" in warning for warning in found.warnings)
+    f_hz = np.arange(7.0, 35.0)
+    over_bed = np.abs(frequency_response(one_mode(42.0, 0.06), f_hz))
+    np.testing.assert_allclose(
+        np.abs(frequency_response(found.plants.nominal, f_hz)), over_bed, rtol=0.05
+    )
