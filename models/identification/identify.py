@@ -43,8 +43,8 @@ from stillpath.models.identification.messages import (
     mounting_notes,
     no_frame_note,
     parted,
+    phase_fault,
     phase_warning,
-    poorly_explained,
     scale_warnings,
     unvaried_notes,
 )
@@ -238,9 +238,10 @@ class _AxisWork:
             found = self._from_spectra(frame_likely)
         else:
             found = self._from_responses()
-            if self._kind == "raw log" and found.fit and poorly_explained(found.fit):
+            fault = phase_fault(found) if self._kind == "raw log" else None
+            if fault is not None:
                 self.late = []
-                found = self._from_magnitudes(found.fit, frame_likely)
+                found = self._from_magnitudes(fault, frame_likely)
         self._steps.stepped(f"axis {self._axis}: fitted")
         notes = [*found.notes, *friction_notes(found.plants)]
         used = [one.measurement for one in self._used]
@@ -349,7 +350,7 @@ class _AxisWork:
         found = replace(found, measured=(*found.measured, *others), notes=tuple(by_file(notes)))
         return scheduled(found, nominal, fits, "spectrum")
 
-    def _from_magnitudes(self, poor: Fit, frame_likely: float) -> AxisIdentification:
+    def _from_magnitudes(self, fault: str, frame_likely: float) -> AxisIdentification:
         """Return the axis from spectra of its logs, whose phase no model explains."""
         column = self._settings.sensor_axis or self._axis
         self._spectra = [
@@ -369,7 +370,7 @@ class _AxisWork:
             found,
             plants=self._rubbing(found.plants),
             notes=(*found.notes, *body_notes(self._friction_mm, None), *left_out),
-            warnings=(*found.warnings, phase_warning(self._axis, poor, read)),
+            warnings=(*found.warnings, phase_warning(self._axis, fault, read)),
         )
 
     def _explained(self) -> Explanations:

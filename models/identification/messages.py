@@ -13,7 +13,14 @@ from stillpath.models.friction import LEAST_MM_S2
 from stillpath.models.identification.estimation import plateau_gain
 from stillpath.models.identification.nozzle import Frame
 from stillpath.models.identification.readers.checks import RANGE_ENDED
-from stillpath.models.identification.types import Excitation, Fit, FrequencyResponse, Spectrum
+from stillpath.models.identification.trust import main_mode_known
+from stillpath.models.identification.types import (
+    AxisIdentification,
+    Excitation,
+    Fit,
+    FrequencyResponse,
+    Spectrum,
+)
 from stillpath.models.plants import PairsSpec, PlantSetSpec, PlantSpec, RelativeModesSpec
 
 __all__ = [
@@ -28,6 +35,8 @@ __all__ = [
     "mounting_notes",
     "no_frame_note",
     "parted",
+    "phase_fault",
+    "phase_warning",
     "scale_warnings",
     "spectrum_level_warning",
     "unvaried_notes",
@@ -174,12 +183,32 @@ def fit_warnings(fit: Fit, sources: Sequence[str], warned: Sequence[str]) -> tup
     return ()
 
 
-def poorly_explained(fit: Fit) -> bool:
-    """Return whether a model misses much of a response, but is not none at all."""
-    return not fit.magnitude_only and _POOR < fit.residual <= _USELESS
+def phase_fault(found: AxisIdentification) -> str | None:
+    """Return why the phase of raw logs cannot be used, by the best fit to them; else None."""
+    fit = found.fit
+    main = max(fit.modes, key=lambda mode: mode.peak, default=None) if fit else None
+    if fit is None or main is None or fit.magnitude_only or fit.residual > _USELESS:
+        return None
+    if fit.residual > _POOR:
+        return (
+            f"the best model misses {fit.residual:.0%} of what the logs say, {_POOR:.0%} at most "
+            "is to be expected"
+        )
+    # Beyond the test nothing was measured, and a table would not tell either.
+    if fit.band_hz[1] < main.f_hz < max(float(one.f_hz[-1]) for one in found.measured):
+        return (
+            f"the axis follows its command up to {fit.band_hz[1]:.1f} Hz only, and what rings most "
+            f"would be at {main.f_hz:.1f} Hz"
+        )
+    if not main_mode_known(fit):
+        return (
+            f"what rings most would be at {main.f_hz:.1f} Hz, give or take "
+            f"{2 * main.f_sd_hz:.1f} Hz"
+        )
+    return None
 
 
-def phase_warning(axis: str, poor: Fit, notes: Sequence[str]) -> str:
+def phase_warning(axis: str, fault: str, notes: Sequence[str]) -> str:
     """Say why of logs with these notes only the magnitude is used."""
     clipped = any(RANGE_ENDED in note for note in notes)
     cause, remedy = (
@@ -191,8 +220,7 @@ def phase_warning(axis: str, poor: Fit, notes: Sequence[str]) -> str:
         )
     )
     return (
-        f"axis {axis.upper()}: the best model misses {poor.residual:.0%} of what the logs say, "
-        f"{_POOR:.0%} at most is to be expected: {cause}. So only the size of the vibrations is "
+        f"axis {axis.upper()}: {fault}: {cause}. So only the size of the vibrations is "
         f"used, as from a resonance table, and the compensation is more cautious. {remedy}, and "
         "measure again"
     )
