@@ -13,7 +13,7 @@ from stillpath.models.friction import LEAST_MM_S2
 from stillpath.models.identification.estimation import plateau_gain
 from stillpath.models.identification.nozzle import Frame
 from stillpath.models.identification.readers.checks import RANGE_ENDED
-from stillpath.models.identification.trust import main_mode_known
+from stillpath.models.identification.trust import main_mode, main_mode_known
 from stillpath.models.identification.types import (
     AxisIdentification,
     Excitation,
@@ -186,7 +186,7 @@ def fit_warnings(fit: Fit, sources: Sequence[str], warned: Sequence[str]) -> tup
 def phase_fault(found: AxisIdentification) -> str | None:
     """Return why the phase of raw logs cannot be used, by the best fit to them; else None."""
     fit = found.fit
-    main = max(fit.modes, key=lambda mode: mode.peak, default=None) if fit else None
+    main = main_mode(fit) if fit else None
     if fit is None or main is None or fit.magnitude_only or fit.residual > _USELESS:
         return None
     if fit.residual > _POOR:

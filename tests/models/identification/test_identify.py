@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable
+from contextlib import nullcontext
 from dataclasses import replace
 from datetime import date
 
@@ -491,6 +492,19 @@ def test_a_mode_that_might_be_anywhere_is_refused_with_what_else_was_found() -> 
     fit = Fit(one_mode(54.0, 0.05), 0.1, 1.0, 0.0, (5.0, 130.0), (unsure,))
     with pytest.raises(ModelError, match=r"give or take 16\.0 Hz; .* And: two labels\. Measure"):
         check_informative(fit, (), ["a.csv"], ["two labels"])
+
+
+@pytest.mark.parametrize(("zeta", "peak", "refused"), [(0.003, 52.0, False), (0.05, 17.0, True)])
+def test_a_mode_beyond_the_band_is_not_the_main_one_for_want_of_damping(
+    zeta: float, peak: float, *, refused: bool
+) -> None:
+    """Of a stiff CoreXY: 95 Hz rings, and how much 177 Hz is damped nobody has measured."""
+    main = ModeEstimate(f_hz=95.0, zeta=0.042, f_sd_hz=0.1, zeta_sd=0.01, peak=16.0)
+    beyond = ModeEstimate(f_hz=177.0, zeta=zeta, f_sd_hz=6.0, zeta_sd=0.01, peak=peak)
+    fit = Fit(one_mode(95.0, 0.042), 0.02, 1.0, 0.0, (6.0, 134.0), (main, beyond))
+    told = pytest.raises(ModelError, match=r"177\.0 Hz, outside the measured 6\.0 to 134\.0 Hz")
+    with told if refused else nullcontext():
+        check_informative(fit, (), ["a.csv"])
 
 
 def test_repeats_alone_make_a_set_of_what_explains_them() -> None:
