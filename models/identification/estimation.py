@@ -181,12 +181,13 @@ def check_plateau(response: FrequencyResponse, excitation: Excitation) -> None:
             "axis moves"
         )
     stated = excitation.accel_per_hz_mm_s
+    rubs = ", or whether the axis rubs much, which makes it move less, too" if gain < 1.0 else ""
     raise ModelError(
         f"{response.source}: between {_PLATEAU_HZ[0]:g} and {_PLATEAU_HZ[1]:g} Hz the axis moved "
         f"{gain:.2f} times as much as commanded with accel_per_hz = {stated:g}; it must be 1 "
         f"within {_PLATEAU_TOLERANCE:.0%}. The log looks like accel_per_hz = {stated * gain:.3g}: "
         "check [resonance_tester] in printer.cfg (default 75 before 2024-12, 60 since) and the "
-        "sensor's scale"
+        f"sensor's scale{rubs}"
     )
 
 

@@ -283,11 +283,12 @@ def spectrum_level_warning(gain: float, excitation: Excitation) -> tuple[str, ..
     stated = excitation.accel_per_hz_mm_s
     if abs(gain - 1) <= 2 * _LEVEL_TOLERANCE:
         return ()
+    rubs = "; an axis that rubs much moves less, too" if gain < 1.0 else ""
     return (
         (
             f"the level at low frequency implies accel_per_hz = {gain * stated:.0f}, stated are "
             f"{stated:g} ({gain - 1:+.0%}); check accel_per_hz, and that this axis was tested and "
-            "its sensor reads right (the shape of the model hardly depends on it)"
+            f"its sensor reads right (the shape of the model hardly depends on it){rubs}"
         ),
     )
 

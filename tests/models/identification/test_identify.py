@@ -18,7 +18,7 @@ from stillpath.models.errors import ModelError
 from stillpath.models.identification.conditioned import Tested, of_one_test
 from stillpath.models.identification.conditions import Condition
 from stillpath.models.identification.identify import Measured, identify
-from stillpath.models.identification.messages import phase_warning
+from stillpath.models.identification.messages import phase_warning, spectrum_level_warning
 from stillpath.models.identification.modal_fit import fit_modes
 from stillpath.models.identification.prompt import prompt
 from stillpath.models.identification.readers import ReadSettings, read_content
@@ -528,6 +528,13 @@ def test_strengths_of_the_test_are_operating_points() -> None:
 
 
 # Spectra
+
+
+@pytest.mark.parametrize("gain", [0.6, 1.4])
+def test_a_level_that_is_too_low_may_be_friction(gain: float) -> None:
+    (warning,) = spectrum_level_warning(gain, LEGACY)
+    assert f"implies accel_per_hz = {75 * gain:.0f}" in warning
+    assert ("rubs much" in warning) == (gain < 1.0)
 
 
 def test_spectra_of_different_tests_have_no_mean() -> None:
