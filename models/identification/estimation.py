@@ -237,7 +237,8 @@ def _check_followed(response: FrequencyResponse, excitation: Excitation) -> None
             f"{response.source}: the log follows a sweep at {excitation.hz_per_s:g} Hz/s at only "
             f"{np.mean(coherent):.0%} of its frequencies (coherence of at least "
             f"{_LEAST_COHERENCE}; at least {_LEAST_FOLLOWED:.0%} are needed): the sensor is too "
-            "noisy or loose, or the sweep was another one, see hz_per_sec in printer.cfg"
+            "noisy or loose, the axis rubs so much that it hardly moves, or the sweep was another "
+            "one, see hz_per_sec in printer.cfg"
         )
     drift_s, per_hz_s = _drift(response.f_hz[coherent], response.response[coherent])
     if abs(drift_s) > _DRIFT_S:

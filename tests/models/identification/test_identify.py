@@ -697,6 +697,11 @@ def test_logs_that_follow_up_to_below_the_resonance_count_as_tables() -> None:
     assert any("the axis follows its command up to" in text for text in found.warnings)
 
 
+def test_logs_that_hardly_follow_are_refused_and_friction_is_named() -> None:
+    with pytest.raises(ModelError, match=r"are needed\): .* the axis rubs so much"):
+        one(raw_file(staggering(quick_log(), 10.0)))
+
+
 @pytest.mark.slow
 def test_a_table_that_rocks_under_a_frame_that_shakes() -> None:
     """Only one of the two is found as the frame; the other one is no more the nozzle's."""
