@@ -181,12 +181,13 @@ def check_plateau(response: FrequencyResponse, excitation: Excitation) -> None:
             "axis moves"
         )
     stated = excitation.accel_per_hz_mm_s
+    rubs = ", or whether the axis rubs much, which makes it move less, too" if gain < 1.0 else ""
     raise ModelError(
         f"{response.source}: between {_PLATEAU_HZ[0]:g} and {_PLATEAU_HZ[1]:g} Hz the axis moved "
         f"{gain:.2f} times as much as commanded with accel_per_hz = {stated:g}; it must be 1 "
         f"within {_PLATEAU_TOLERANCE:.0%}. The log looks like accel_per_hz = {stated * gain:.3g}: "
         "check [resonance_tester] in printer.cfg (default 75 before 2024-12, 60 since) and the "
-        "sensor's scale"
+        f"sensor's scale{rubs}"
     )
 
 
@@ -236,7 +237,8 @@ def _check_followed(response: FrequencyResponse, excitation: Excitation) -> None
             f"{response.source}: the log follows a sweep at {excitation.hz_per_s:g} Hz/s at only "
             f"{np.mean(coherent):.0%} of its frequencies (coherence of at least "
             f"{_LEAST_COHERENCE}; at least {_LEAST_FOLLOWED:.0%} are needed): the sensor is too "
-            "noisy or loose, or the sweep was another one, see hz_per_sec in printer.cfg"
+            "noisy or loose, the axis rubs so much that it hardly moves, or the sweep was another "
+            "one, see hz_per_sec in printer.cfg"
         )
     drift_s, per_hz_s = _drift(response.f_hz[coherent], response.response[coherent])
     if abs(drift_s) > _DRIFT_S:

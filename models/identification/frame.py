@@ -32,10 +32,13 @@ _BESIDE = 0.25
 """Largest |log| of the ratio of a pair of zeros to the pair of poles that it belongs to."""
 
 
-def shaken(crowd: Sequence[P], rng: np.random.Generator, likely: float) -> list[P]:
+def shaken(
+    crowd: Sequence[P], rng: np.random.Generator, likely: float, known_hz: float | None = None
+) -> list[P]:
     """Remove the frame's mode from a share `likely` of plants."""
     frame = rng.random(len(crowd)) < likely
-    return [without_frame(p) if shakes else p for p, shakes in zip(crowd, frame, strict=True)]
+    pairs = zip(crowd, frame, strict=True)
+    return [without_frame(p, known_hz) if shakes else p for p, shakes in pairs]
 
 
 def frame_hz_of(crowd: Sequence[PlantSpec]) -> float | None:
@@ -54,34 +57,49 @@ def likely_of(frames_hz: Iterable[float | None]) -> float:
     return LIKELY if not seen or max(seen) < _UNLIKE * min(seen) else _UNLIKE_LIKELY
 
 
-def without_frame(plant: P) -> P:
-    """Return the plant without weak modes far below its strongest one; others as they are."""
+def without_frame(plant: P, known_hz: float | None = None) -> P:
+    """Return the plant without weak modes far below its strongest one; others as they are.
+
+    Parameters
+    ----------
+    known_hz : float, optional
+        Frequency of a frame that was found and removed already. What it leaves there is what the
+        nozzle does as the frame shakes; a mode elsewhere may be that of the table under it.
+    """
     made: PlantSpec = plant
     if isinstance(plant, RelativeModesSpec):
-        made = _modes_without(plant)
+        made = _modes_without(plant, known_hz)
     elif isinstance(plant, PairsSpec):
-        made = _pairs_without(plant)
+        made = _pairs_without(plant, known_hz)
     return cast(P, made)
 
 
-def _modes_without(plant: RelativeModesSpec) -> RelativeModesSpec:
+def _of_known(f_hz: float, known_hz: float | None) -> bool:
+    return known_hz is not None and _apart(f_hz, known_hz) < np.log(_UNLIKE)
+
+
+def _modes_without(plant: RelativeModesSpec, known_hz: float | None) -> RelativeModesSpec:
     strongest = max(plant.modes, key=lambda m: abs(m.share) / m.zeta)
     most_hz = min(_HIGHEST_HZ, _BELOW * strongest.f_hz)
-    kept = [m for m in plant.modes if abs(m.share) > _SHARE or m.f_hz > most_hz]
+    kept = [
+        m
+        for m in plant.modes
+        if abs(m.share) > _SHARE or m.f_hz > most_hz or _of_known(m.f_hz, known_hz)
+    ]
     total = sum(m.share for m in kept)
     return RelativeModesSpec(
         modes=tuple(m.model_copy(update={"share": m.share / total}) for m in kept)
     )
 
 
-def _pairs_without(plant: PairsSpec) -> PairsSpec:
+def _pairs_without(plant: PairsSpec, known_hz: float | None) -> PairsSpec:
     poles, zeros = list(plant.poles), list(plant.zeros)
     if len(poles) < 2:
         return plant
     peaks = np.abs(frequency_response(plant, [p.f_hz for p in poles]))
     most_hz = min(_HIGHEST_HZ, _BELOW * poles[int(np.argmax(peaks))].f_hz)
     for pole in plant.poles:
-        if pole.f_hz > most_hz:
+        if pole.f_hz > most_hz or _of_known(pole.f_hz, known_hz):
             continue
         beside = [z for z in zeros if abs(z.zeta) < 1 and _apart(z.f_hz, pole.f_hz) < _BESIDE]
         if beside:

@@ -37,18 +37,20 @@ from stillpath.models.identification.messages import (
     body_notes,
     by_file,
     fit_warnings,
+    frame_mode_notes,
     friction_notes,
     level_warnings,
     mounting_notes,
     no_frame_note,
     parted,
+    phase_fault,
     phase_warning,
-    poorly_explained,
     scale_warnings,
     unvaried_notes,
 )
 from stillpath.models.identification.modal_fit import refit
 from stillpath.models.identification.nozzle import Frame, frame_of
+from stillpath.models.identification.prompt import prompt
 from stillpath.models.identification.readers import (
     ReadSettings,
     date_in_name,
@@ -236,9 +238,10 @@ class _AxisWork:
             found = self._from_spectra(frame_likely)
         else:
             found = self._from_responses()
-            if self._kind == "raw log" and found.fit and poorly_explained(found.fit):
+            fault = phase_fault(found) if self._kind == "raw log" else None
+            if fault is not None:
                 self.late = []
-                found = self._from_magnitudes(found.fit, frame_likely)
+                found = self._from_magnitudes(fault, frame_likely)
         self._steps.stepped(f"axis {self._axis}: fitted")
         notes = [*found.notes, *friction_notes(found.plants)]
         used = [one.measurement for one in self._used]
@@ -276,10 +279,10 @@ class _AxisWork:
         frame_firm = self._settings.frame_firm or bool(special([c for _, c in responses]))
         frame: Frame | None = None
         if self._kind == "raw log":
-            frame = None if frame_firm else _frame(responses, common)
+            frame = None if frame_firm else frame_of([r for r, c in responses if c in common])
             responses = self._without_friction(responses, common, frame)
             if self._friction_mm and not frame_firm:
-                frame = _frame(responses, common, near=frame)
+                frame = frame_of([r for r, c in responses if c in common], near=frame)
         chosen = [r for r, c in responses if c in common]
         if frame is not None:
             chosen = [frame.over_bed(response) for response in chosen]
@@ -287,7 +290,8 @@ class _AxisWork:
             chosen,
             axis=self._axis,
             kind=self._kind,
-            frame_firm=frame_firm or frame is not None,
+            frame_firm=frame_firm,
+            frame_hz=frame.f_hz if frame else None,
             max_order=self._max_order,
             origin=self._origin,
             progress=self._steps.within(f"axis {self._axis}: fitting"),
@@ -300,19 +304,20 @@ class _AxisWork:
         }
         others = tuple(r for r, c in responses if c not in common)
         notes: list[str] = []
+        left_out = frame_mode_notes(prompt(nominal), found.plants.nominal)
         if self._kind == "raw log":
             warnings = level_warnings(chosen, nominal)
             mounting = [] if self._settings.sensor_axis else mounting_notes(self._axis, chosen)
             notes = [*mounting, *body_notes(self._friction_mm, frame)]
             at = [k for k, (_, c) in enumerate(responses) if c in common]
-            self.late = self._lateness(at, chosen, found.plants.nominal)
+            self.late = self._lateness(at, chosen, prompt(nominal))
         else:
             warnings = scale_warnings(chosen, nominal)
         found = replace(
             found,
             plants=self._rubbing(found.plants),
             measured=(*found.measured, *others),
-            warnings=(*found.warnings, *warnings),
+            warnings=(*found.warnings, *warnings, *left_out),
             notes=tuple(notes),
         )
         return scheduled(found, nominal, fits, self._kind)
@@ -345,7 +350,7 @@ class _AxisWork:
         found = replace(found, measured=(*found.measured, *others), notes=tuple(by_file(notes)))
         return scheduled(found, nominal, fits, "spectrum")
 
-    def _from_magnitudes(self, poor: Fit, frame_likely: float) -> AxisIdentification:
+    def _from_magnitudes(self, fault: str, frame_likely: float) -> AxisIdentification:
         """Return the axis from spectra of its logs, whose phase no model explains."""
         column = self._settings.sensor_axis or self._axis
         self._spectra = [
@@ -365,7 +370,7 @@ class _AxisWork:
             found,
             plants=self._rubbing(found.plants),
             notes=(*found.notes, *body_notes(self._friction_mm, None), *left_out),
-            warnings=(*found.warnings, phase_warning(self._axis, poor, read)),
+            warnings=(*found.warnings, phase_warning(self._axis, fault, read)),
         )
 
     def _explained(self) -> Explanations:
@@ -469,15 +474,6 @@ class _AxisWork:
 
     def _rubbing(self, plants: PlantSetSpec) -> PlantSetSpec:
         return plants.with_friction(self._friction_mm) if self._friction_mm else plants
-
-
-def _frame(
-    responses: Sequence[tuple[FrequencyResponse, Condition]],
-    common: Collection[Condition],
-    near: Frame | None = None,
-) -> Frame | None:
-    """Return the frame that shakes in raw logs, if one is seen."""
-    return frame_of(mean_response([r for r, c in responses if c in common]), near)
 
 
 def _axis(measurement: Measurement, settings: ReadSettings) -> Axis:

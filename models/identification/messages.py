@@ -13,8 +13,15 @@ from stillpath.models.friction import LEAST_MM_S2
 from stillpath.models.identification.estimation import plateau_gain
 from stillpath.models.identification.nozzle import Frame
 from stillpath.models.identification.readers.checks import RANGE_ENDED
-from stillpath.models.identification.types import Excitation, Fit, FrequencyResponse, Spectrum
-from stillpath.models.plants import PlantSetSpec, RelativeModesSpec
+from stillpath.models.identification.trust import main_mode, main_mode_known
+from stillpath.models.identification.types import (
+    AxisIdentification,
+    Excitation,
+    Fit,
+    FrequencyResponse,
+    Spectrum,
+)
+from stillpath.models.plants import PairsSpec, PlantSetSpec, PlantSpec, RelativeModesSpec
 
 __all__ = [
     "apart_warning",
@@ -28,6 +35,8 @@ __all__ = [
     "mounting_notes",
     "no_frame_note",
     "parted",
+    "phase_fault",
+    "phase_warning",
     "scale_warnings",
     "spectrum_level_warning",
     "unvaried_notes",
@@ -102,18 +111,25 @@ def friction_notes(plants: PlantSetSpec) -> list[str]:
     return [note]
 
 
-def frame_mode_notes(felt: RelativeModesSpec, kept: RelativeModesSpec) -> list[str]:
-    """Say which modes of a table are left out as the frame's."""
-    known_hz = {mode.f_hz for mode in kept.modes}
-    left_out = [f"{mode.f_hz:.1f} Hz" for mode in felt.modes if mode.f_hz not in known_hz]
+def frame_mode_notes(felt: PlantSpec, kept: PlantSpec, *, table: bool = False) -> list[str]:
+    """Say which modes of a log, or of a table, are left out as the frame's."""
+    known_hz = _modes_hz(kept)
+    left_out = [f"{f_hz:.1f} Hz" for f_hz in _modes_hz(felt) if f_hz not in known_hz]
     if not left_out:
         return []
+    better = "; raw logs would tell" if table else ""
     note = (
         f"what shakes weakly at {' and '.join(left_out)}, far below the strongest resonance, is "
-        "taken to be the frame on its feet: the sensor feels it, the nozzle over the bed does not "
-        "(frame_firm leaves it in; raw logs would tell)"
+        "taken to be the frame on its feet, or what it stands on: the sensor feels it, the nozzle "
+        f"over the bed does not (frame_firm leaves it in{better})"
     )
     return [note]
+
+
+def _modes_hz(plant: PlantSpec) -> list[float]:
+    if isinstance(plant, RelativeModesSpec):
+        return [mode.f_hz for mode in plant.modes]
+    return [pole.f_hz for pole in plant.poles] if isinstance(plant, PairsSpec) else []
 
 
 def no_frame_note(frames_hz: Mapping[Literal["x", "y"], float | None]) -> str:
@@ -167,12 +183,32 @@ def fit_warnings(fit: Fit, sources: Sequence[str], warned: Sequence[str]) -> tup
     return ()
 
 
-def poorly_explained(fit: Fit) -> bool:
-    """Return whether a model misses much of a response, but is not none at all."""
-    return not fit.magnitude_only and _POOR < fit.residual <= _USELESS
+def phase_fault(found: AxisIdentification) -> str | None:
+    """Return why the phase of raw logs cannot be used, by the best fit to them; else None."""
+    fit = found.fit
+    main = main_mode(fit) if fit else None
+    if fit is None or main is None or fit.magnitude_only or fit.residual > _USELESS:
+        return None
+    if fit.residual > _POOR:
+        return (
+            f"the best model misses {fit.residual:.0%} of what the logs say, {_POOR:.0%} at most "
+            "is to be expected"
+        )
+    # Beyond the test nothing was measured, and a table would not tell either.
+    if fit.band_hz[1] < main.f_hz < max(float(one.f_hz[-1]) for one in found.measured):
+        return (
+            f"the axis follows its command up to {fit.band_hz[1]:.1f} Hz only, and what rings most "
+            f"would be at {main.f_hz:.1f} Hz"
+        )
+    if not main_mode_known(fit):
+        return (
+            f"what rings most would be at {main.f_hz:.1f} Hz, give or take "
+            f"{2 * main.f_sd_hz:.1f} Hz"
+        )
+    return None
 
 
-def phase_warning(axis: str, poor: Fit, notes: Sequence[str]) -> str:
+def phase_warning(axis: str, fault: str, notes: Sequence[str]) -> str:
     """Say why of logs with these notes only the magnitude is used."""
     clipped = any(RANGE_ENDED in note for note in notes)
     cause, remedy = (
@@ -184,8 +220,7 @@ def phase_warning(axis: str, poor: Fit, notes: Sequence[str]) -> str:
         )
     )
     return (
-        f"axis {axis.upper()}: the best model misses {poor.residual:.0%} of what the logs say, "
-        f"{_POOR:.0%} at most is to be expected: {cause}. So only the size of the vibrations is "
+        f"axis {axis.upper()}: {fault}: {cause}. So only the size of the vibrations is "
         f"used, as from a resonance table, and the compensation is more cautious. {remedy}, and "
         "measure again"
     )
@@ -248,11 +283,12 @@ def spectrum_level_warning(gain: float, excitation: Excitation) -> tuple[str, ..
     stated = excitation.accel_per_hz_mm_s
     if abs(gain - 1) <= 2 * _LEVEL_TOLERANCE:
         return ()
+    rubs = "; an axis that rubs much moves less, too" if gain < 1.0 else ""
     return (
         (
             f"the level at low frequency implies accel_per_hz = {gain * stated:.0f}, stated are "
             f"{stated:g} ({gain - 1:+.0%}); check accel_per_hz, and that this axis was tested and "
-            "its sensor reads right (the shape of the model hardly depends on it)"
+            f"its sensor reads right (the shape of the model hardly depends on it){rubs}"
         ),
     )
 

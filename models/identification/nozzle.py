@@ -14,6 +14,7 @@ later fits need not tell the frame from a mode.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,6 +22,7 @@ from scipy.optimize import least_squares
 from scipy.signal import find_peaks
 
 from stillpath.models.arrays import Array, Complex
+from stillpath.models.identification.averaging import mean_response
 from stillpath.models.identification.last_kept import last_kept
 from stillpath.models.identification.modal_fit import of_poles
 from stillpath.models.identification.modal_structure import ModalStructure
@@ -84,15 +86,20 @@ class Frame:
         return replace(measured, response=measured.response * more, sd=measured.sd * np.abs(more))
 
 
-def frame_of(measured: FrequencyResponse, near: Frame | None = None) -> Frame | None:
+def frame_of(
+    measured: FrequencyResponse | Sequence[FrequencyResponse], near: Frame | None = None
+) -> Frame | None:
     """Return the frame that a response shows; None if there is none that is clear.
 
     Parameters
     ----------
+    measured : FrequencyResponse or sequence of them
+        Several are averaged first.
     near : Frame, optional
         What the response showed before friction was removed from it: look for this one again.
     """
-    data = response_data(measured).thinned(_POINTS)
+    single = measured if isinstance(measured, FrequencyResponse) else mean_response(measured)
+    data = response_data(single).thinned(_POINTS)
     held = _start(data)
     starts = [Frame(f_hz, *_START) for f_hz in _STARTS_HZ] if near is None else [near]
     tried = [_polished(data, held.on_its_feet(frame)) for frame in starts]

@@ -43,6 +43,7 @@ def explain_response(
     fit: Fit,
     *,
     frame_firm: bool = False,
+    frame_hz: float | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> tuple[Population[PlantSpec], tuple[float, float]]:
     """Return plants that stand for all that explain repeats of one response.
@@ -56,6 +57,8 @@ def explain_response(
     frame_firm : bool
         Whether the frame is known to stand firm; else four fifths of the plants are without what
         may be its mode.
+    frame_hz : float, optional
+        Of a frame that was found and removed from the responses.
     progress : callable, optional
         Told the share done, 0 to 1.
 
@@ -87,8 +90,8 @@ def explain_response(
     delays_s += [delay_of(found.spec) for found, _ in explaining]
     centres = [prompt(fit)]
     if not frame_firm:
-        crowd = shaken(crowd, rng, LIKELY)
-        centres.append(without_frame(centres[0]))
+        crowd = shaken(crowd, rng, LIKELY, frame_hz)
+        centres.append(without_frame(centres[0], frame_hz))
     population = representatives(centres, crowd)
     return population, (float(min(delays_s)), float(max(delays_s)))
 

@@ -98,6 +98,7 @@ def response_set(
     axis: str,
     kind: Kind = "raw log",
     frame_firm: bool = False,
+    frame_hz: float | None = None,
     max_order: int = 4,
     origin: Origin = _UNKNOWN,
     progress: Callable[[float], None] | None = None,
@@ -107,22 +108,21 @@ def response_set(
     Responses with the same label are repeats, which show the scatter. Labels that differ beyond it
     become members, fits of one structure; nominal is the fit to the mean of all (weighted by
     1/sd^2, delays aligned). Where nothing differs, members are what else explains the responses
-    (`response_bootstrap`), and nominal is the first of them: that fit, without the mode of the
-    frame unless the frame is firm.
+    (`response_bootstrap`), the first of them nominal: that fit, without a frame that is not firm.
 
     Parameters
     ----------
     frame_firm : bool
         What the sensor feels is what prints (`ReadSettings.frame_firm`).
+    frame_hz : float, optional
+        Of a frame that was found and removed from the responses.
 
     Raises
     ------
     ModelError
         If there is no response, or one cannot be fitted.
     """
-    if not measured:
-        raise ModelError(f"axis {axis}: no frequency response to identify from; give one or more")
-    groups = _by_label(measured)
+    groups = _by_label(measured, axis)
     means = [mean_response(group) for group in groups]
     if len(means) > 1:
         # The mean of shifted peaks has humps that no machine has: they must not add modes.
@@ -135,7 +135,7 @@ def response_set(
         plants = plant_set_from(fit, kept, kind=kind, origin=origin)
     else:
         population, delays_s = explain_response(
-            measured, fit, frame_firm=frame_firm, progress=drawn
+            measured, fit, frame_firm=frame_firm, frame_hz=frame_hz, progress=drawn
         )
         plants = PlantSetSpec(
             nominal=population.members[0],
@@ -314,7 +314,9 @@ def delays_compared(found: dict[Axis, AxisIdentification]) -> dict[Axis, AxisIde
     return {a: replace(one, warnings=(*one.warnings, warning)) for a, one in found.items()}
 
 
-def _by_label(measured: Sequence[FrequencyResponse]) -> list[list[FrequencyResponse]]:
+def _by_label(measured: Sequence[FrequencyResponse], axis: str) -> list[list[FrequencyResponse]]:
+    if not measured:
+        raise ModelError(f"axis {axis}: no frequency response to identify from; give one or more")
     groups: dict[str, list[FrequencyResponse]] = {}
     for response in measured:
         groups.setdefault(response.label, []).append(response)

@@ -114,7 +114,9 @@ class Explanations:
             *spectrum_level_warning(gain, self.excitation),
             *cross_axis_warning(*cross, self.column),
             *apart_warning(self.spectra, search.repeats),
-            *frame_mode_notes(chosen.structure.spec(chosen.theta), population.members[0]),
+            *frame_mode_notes(
+                chosen.structure.spec(chosen.theta), population.members[0], table=True
+            ),
         )
         fit = Fit(
             spec=population.members[0],

@@ -13,6 +13,7 @@ from stillpath.models.identification.types import (
     AxisIdentification,
     Fit,
     FrequencyResponse,
+    ModeEstimate,
     Spectrum,
 )
 
@@ -21,6 +22,7 @@ __all__ = [
     "check_directions",
     "check_informative",
     "keeps_time",
+    "main_mode",
     "main_mode_known",
 ]
 
@@ -29,6 +31,8 @@ _PRINTERS_HZ = 150.0
 """Printers have their modes below this frequency: a model need not follow above it."""
 _MAIN_HZ = (1.0, 500.0)
 """As for a resonance that is typed in."""
+_UNSEEN_ZETA = 0.03
+"""Least damping of a mode beyond the band, of which only the flank was measured."""
 _MOST_UNSURE = 0.05
 """Relative standard deviation of the frequency of the mode that rings most."""
 _MOST_LEVEL = 2.0
@@ -65,9 +69,7 @@ def check_informative(
         _check_coherent(one, names)
     low, high = fit.band_hz
     told = "".join(f"And: {warning}. " for warning in warnings)
-    # In a spectrum, modes beyond the band only shape its flank.
-    seen = [m for m in fit.modes if low <= m.f_hz <= high] if fit.magnitude_only else []
-    main = max(seen or fit.modes, key=lambda m: m.peak, default=None)
+    main = main_mode(fit)
     if main is None:
         return
     if not low <= main.f_hz <= high:
@@ -91,9 +93,25 @@ def check_informative(
         )
 
 
+def main_mode(fit: Fit) -> ModeEstimate | None:
+    """Return the mode that rings most; None without modes.
+
+    In a spectrum, modes beyond the band only shape its flank. In a response, too, their damping is
+    hardly known: they count with a usual one if they seem to have less.
+    """
+    low, high = fit.band_hz
+    seen = [m for m in fit.modes if low <= m.f_hz <= high] if fit.magnitude_only else []
+
+    def rings(mode: ModeEstimate) -> float:
+        known = mode.f_hz <= high or mode.zeta >= _UNSEEN_ZETA
+        return mode.peak if known else mode.peak * mode.zeta / _UNSEEN_ZETA
+
+    return max(seen or fit.modes, key=rings, default=None)
+
+
 def main_mode_known(fit: Fit) -> bool:
     """Return whether the mode that rings most is known closely enough to be compensated."""
-    main = max(fit.modes, key=lambda mode: mode.peak, default=None)
+    main = main_mode(fit)
     return main is None or not main.f_sd_hz > _MOST_UNSURE * main.f_hz or np.isinf(main.f_sd_hz)
 
 

@@ -40,6 +40,10 @@ _LEAST_END_HZ, _END_DIFFERS_HZ = 40.0, 8.0
 _BESIDE_HZ, _FALL = 15.0, 100.0
 """A test's third harmonic has 1/243 of the density of its fundamental; no resonance falls by 100
 within so few Hz."""
+_BESIDE_SLOW_HZ, _SLOW_RATE_HZ, _LEAST_SLOW_S = 0.05, 20.0, 30.0
+_SLOW_MM_S2, _MOVED_MM_S2 = (60.0, 180.0), 500.0
+"""Slow motion without and with the slow sweep, rms: its 400 mm/s^2 are 360 in the first harmonic.
+Below the last value in all, the sensor did not move with the test and tells nothing."""
 _DIAGONAL = re.compile(r"-?\d+(\.\d+)?,-?\d+(\.\d+)?(,-?\d+(\.\d+)?)?")
 _DAY = re.compile(r"\d{4}-\d\d-\d\d")
 _DATE = re.compile(r"(?<!\d)(20\d\d)[-_]?(\d\d)[-_]?(\d\d)(?!\d)")
@@ -155,7 +159,8 @@ def excitation_for(
 
     Defaults of klippy/extras/resonance_tester.py: before 2024-12 from 5 to 133.33 Hz with
     75 mm/s and without the slow square wave; since then from 5 to 135 Hz with 60 mm/s,
-    400 mm/s^2 and 1.2 s. Always 1 Hz/s.
+    400 mm/s^2 and 1.2 s. Always 1 Hz/s. A raw log tells which by its slow motion, whatever its
+    date: many printers have an older Klipper than the day.
 
     Raises
     ------
@@ -195,8 +200,9 @@ def _resolved(measurement: AccelerationLog | Spectrum, settings: ReadSettings) -
             "give the axis"
         )
     made = settings.firmware_date or date_in_name(measurement.source)
-    old = made is not None and made < _NEW_TEST
     defaults = Excitation(direction=direction_of(axis))
+    by_log = _contradicts(measurement, settings, made)
+    old = _is_old(made) is not by_log
     given = {
         "accel_per_hz_mm_s": settings.accel_per_hz_mm_s,
         "f_start_hz": settings.f_start_hz,
@@ -232,7 +238,7 @@ def _resolved(measurement: AccelerationLog | Spectrum, settings: ReadSettings) -
         )
     excitation = Excitation(direction=defaults.direction, **values)
     if assumed:
-        era = _era(made, settings)
+        era = _era(made, settings, by_log=by_log)
         found.append(f"assumed {', '.join(assumed)}: the defaults of Klipper {era}")
     return _Resolved(excitation, tuple(found))
 
@@ -263,11 +269,50 @@ def _falls(spectrum: Spectrum, end_hz: float) -> bool:
     return bool(np.median(density[inside]) > _FALL * np.median(density[outside]))
 
 
-def _era(made: date | None, settings: ReadSettings) -> str:
+def _is_old(made: date | None) -> bool:
+    return made is not None and made < _NEW_TEST
+
+
+def _contradicts(
+    measurement: AccelerationLog | Spectrum, settings: ReadSettings, made: date | None
+) -> bool:
+    """Return whether a raw log shows another test than that of its day."""
+    if settings.sweeping_accel_mm_s2 is not None or not isinstance(measurement, AccelerationLog):
+        return False
+    period_s = settings.sweeping_period_s or Excitation((1.0, 0.0)).sweeping_period_s
+    return _sweeps(measurement, period_s) is _is_old(made)
+
+
+def _sweeps(log: AccelerationLog, period_s: float) -> bool | None:
+    """Return whether a log shows the slow square wave of tests since 2024-12; None if unsure."""
+    time_s, accel = log.time_s, log.accel_mm_s2
+    accel = accel[:, ~np.isnan(accel).any(axis=0)]
+    if not accel.size or time_s[-1] - time_s[0] < _LEAST_SLOW_S:
+        return None
+    rate_hz = len(time_s) / float(time_s[-1] - time_s[0])
+    block = max(1, round(rate_hz / _SLOW_RATE_HZ))
+    means = accel[: len(accel) // block * block].reshape(-1, block, accel.shape[1]).mean(axis=1)
+    f_hz = np.fft.rfftfreq(len(means), block / rate_hz)
+    slow = np.fft.rfft(means - means.mean(axis=0), axis=0) / len(means)
+    inside = np.abs(f_hz - 1.0 / period_s) <= _BESIDE_SLOW_HZ
+    slow_mm_s2 = math.sqrt(2.0 * float(np.sum(np.abs(slow[inside]) ** 2)))
+    if slow_mm_s2 >= _SLOW_MM_S2[1]:
+        return True
+    moved_mm_s2 = math.sqrt(float(np.sum(np.var(accel, axis=0))))
+    return False if slow_mm_s2 <= _SLOW_MM_S2[0] and moved_mm_s2 >= _MOVED_MM_S2 else None
+
+
+def _era(made: date | None, settings: ReadSettings, *, by_log: bool) -> str:
     if made is None:
+        if by_log:
+            return "before 2024-12, because the log shows no slow sweep"
         return (
             "since 2024-12, because no date is known (give firmware_date if the firmware is older)"
         )
-    era = "before 2024-12" if made < _NEW_TEST else "since 2024-12"
+    old = _is_old(made)
     told = "firmware_date" if settings.firmware_date else "the date in the file's name"
+    if by_log:
+        era, shows = ("since 2024-12", "a") if old else ("before 2024-12", "no")
+        return f"{era}, because the log shows {shows} slow sweep, whatever {told}, {made}, says"
+    era = "before 2024-12" if old else "since 2024-12"
     return f"{era} by {told}, {made.isoformat()}"

@@ -161,6 +161,8 @@ def test_a_wrong_level_names_the_level_of_the_log(true_level: float) -> None:
         estimate_response(log, SHORT)
     told = str(caught.value).split("looks like accel_per_hz = ")[1]
     assert float(told.split(":")[0]) == pytest.approx(true_level, rel=0.03)
+    # Friction makes an axis move less, never more.
+    assert ("rubs much" in told) == (true_level < 60.0)
 
 
 def test_a_sensor_that_is_only_shaken_along_has_its_own_message() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from datetime import date
 
 import numpy as np
@@ -17,7 +18,9 @@ from stillpath.models.identification.readers import (
     excitation_for,
     excitation_notes,
 )
+from stillpath.models.identification.synthetic import Sensor
 from stillpath.models.identification.types import Excitation, Spectrum
+from tests.models.identification.recordings import LEGACY, SWEEPING, quick_log
 
 
 def spectrum(
@@ -48,6 +51,40 @@ def test_defaults_by_date(
     (note,) = excitation_notes(spectrum(source), settings)
     assert words in note
     assert f"accel_per_hz {expected.accel_per_hz_mm_s:g}" in note
+
+
+@pytest.mark.parametrize(
+    ("test", "name", "settings", "words"),
+    [
+        (LEGACY, "20250601_101010", {}, "no slow sweep, whatever the date in the file's name"),
+        (LEGACY, "mine", {}, "before 2024-12, because the log shows no slow sweep"),
+        (LEGACY, "20250601_101010", {"accel_per_hz_mm_s": 75.0}, "before 2024-12, because"),
+        (LEGACY, "20230601_101010", {}, "before 2024-12 by the date"),
+        (
+            SWEEPING,
+            "mine",
+            {"firmware_date": "2023-01-01"},
+            "because the log shows a slow sweep",
+        ),
+        (SWEEPING, "20250601_101010", {}, "since 2024-12 by the date"),
+    ],
+)
+def test_raw_logs_tell_which_test_they_are_of(
+    test: Excitation, name: str, settings: dict[str, object], words: str
+) -> None:
+    """Printers of 2025 with a Klipper of 2022 are common; friction was blamed for it, and lost."""
+    log = quick_log("x", test=test, sensor=Sensor(rate_hz=500.0, noise_mm_s2=80.0, gain=0.88))
+    log = replace(log, source=f"raw_data_x_{name}.csv")
+    given = ReadSettings.model_validate(settings)
+    assert excitation_for(log, given) == (OLD if test is LEGACY else NEW)
+    (note,) = excitation_notes(log, given)
+    assert words in note
+
+
+def test_a_log_that_hardly_moves_tells_nothing() -> None:
+    log = quick_log("x", test=LEGACY, sensor=Sensor(rate_hz=500.0, gain=0.02))
+    log = replace(log, source="raw_data_x_20250601_101010.csv")
+    assert excitation_for(log) == NEW
 
 
 @pytest.mark.parametrize(
