@@ -132,7 +132,7 @@ def test_long_stretches_stay_in_time(body: str) -> None:
     # Where vertices lie on steps, and when steps come, are off by up to a step each. A vertex that
     # is left out costs some more along the path, for some milliseconds.
     step = np.hypot(1.0, 1.0) / 160.0
-    assert np.quantile(gap[made.extruding], 0.998) <= tolerance + 2.5 * step
+    assert np.quantile(gap[made.extruding], 0.998) <= tolerance + 2.8 * step
     assert np.max(gap[made.extruding]) <= tolerance + 4.0 * step
 
 
