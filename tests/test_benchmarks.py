@@ -28,7 +28,7 @@ GEAR = str(ROOT / "examples" / "cura_ender3_gear24.gcode")
             "quality.py",
             GEAR,
             "--machines",
-            "voron-v0",
+            "voron-v24-250",
             "--tolerance-um",
             "2",
             "--robust",
