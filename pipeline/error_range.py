@@ -14,7 +14,7 @@ from typing import TypeAlias
 import numpy as np
 
 from stillpath.models.arrays import Array
-from stillpath.models.friction import DryFriction, held_back_mm
+from stillpath.models.friction import BEND_MM, DryFriction, held_back_mm
 from stillpath.models.machine import Machine
 from stillpath.models.plant_specs import PlantSetSpec
 from stillpath.models.plants import DiscretePlant, plant_set
@@ -33,9 +33,11 @@ __all__ = [
 
 Pair: TypeAlias = tuple[DiscretePlant, DiscretePlant]
 
-_FRICTION_UNSURE = 0.35
+_FRICTION_UNSURE, _WHEELS_UNSURE = 0.35, 1.0
 """Relative error of identified friction: its size is typically 10 % off on virtual printers, rarely
-25 %, and how it builds up when the motion reverses is a guess."""
+25 %, and how it builds up when the motion reverses is a guess. Wheels roll on their bent rims for
+10 to 90 um, more than the `models.friction.BEND_MM` that is assumed: where friction holds an axis
+that far, up to half of it is not found."""
 _FRICTION_UNSEEN_MM_S2 = 1500.0
 """Dry friction over moving mass that tables may hide: .4 N on .25 kg of rails, 1.5 N on a bed."""
 _STEPS_UNSURE = 0.2
@@ -152,6 +154,8 @@ def error_ranges(
     unseen_mm = [unseen_friction_mm(machine.axes[axis]) for axis in ("x", "y")]
     assumed = [machine.axes[axis].friction_assumed for axis in ("x", "y")]
     unsure_mm = np.where(assumed, 1.0, _FRICTION_UNSURE) * known_mm
+    wheels = np.minimum(known_mm / BEND_MM, 1.0) * (_WHEELS_UNSURE - _FRICTION_UNSURE)
+    more_mm = known_mm + np.where(assumed, unsure_mm, (_FRICTION_UNSURE + wheels) * known_mm)
 
     def range_of(command: Array) -> ErrorRange:
         def rubbed(held_mm: Array, creep_s: float = dt_s) -> float:
@@ -164,7 +168,7 @@ def error_ranges(
             rms(_delayed(response(pair, received), lag))
             for pair, lag in zip(pairs, lags, strict=True)
         ]
-        less, more = rubbed(known_mm - unsure_mm), rubbed(known_mm + unsure_mm)
+        less, more = rubbed(known_mm - unsure_mm), rubbed(more_mm)
         bent = rubbed(known_mm, 0.0)  # guides that do not creep
         return ErrorRange(
             1e3 * error,
