@@ -98,7 +98,7 @@ class DryFriction:
     held_mm : sequence of float
         Distance by which friction holds each axis back; 0: no friction.
     dt_s : float
-        Between samples.
+        Between samples; 0: guides do not creep.
     """
 
     def __init__(self, held_mm: Sequence[float], dt_s: float) -> None:

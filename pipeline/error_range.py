@@ -158,8 +158,9 @@ def error_ranges(
     more_mm = known_mm + np.where(assumed, unsure_mm, (_FRICTION_UNSURE + wheels) * known_mm)
 
     def range_of(command: Array) -> ErrorRange:
-        def rubbed(held_mm: Array, creep_s: float = dt_s) -> float:
-            received = DryFriction(held_mm.tolist(), creep_s).received_mm(command)
+        def rubbed(held_mm: Array, *, creeps: bool = True) -> float:
+            guides = DryFriction(held_mm.tolist(), dt_s if creeps else 0.0)
+            received = guides.received_mm(command)
             return rms(response((x.nominal, y.nominal), received))
 
         received = DryFriction(known_mm.tolist(), dt_s).received_mm(command)
@@ -169,7 +170,7 @@ def error_ranges(
             for pair, lag in zip(pairs, lags, strict=True)
         ]
         less, more = rubbed(known_mm - unsure_mm), rubbed(more_mm)
-        bent = rubbed(known_mm, 0.0)  # guides that do not creep
+        bent = rubbed(known_mm, creeps=False)
         return ErrorRange(
             1e3 * error,
             min(error, less, *errors) / error,

@@ -88,7 +88,7 @@ def test_it_tracks(kind: str, name: str, limit_um: float) -> None:
     after = np.abs(answer(machine, u) - y_d).max() * 1e3
     before = np.abs(answer(machine, y_d) - y_d).max() * 1e3
     assert after < min(limit_um, before)
-    assert kind in ("zmetc", "npz-ignore") or after < before / 2.5
+    assert kind in ("zmetc", "npz-ignore") or after < before / (2.5 if name == "voron-v0" else 4)
     assert np.abs(np.diff(u, 2)).max() <= 20_000e-6
     np.testing.assert_array_equal(u[:, [0, -1]], y_d[:, [0, -1]])
 
