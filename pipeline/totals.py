@@ -165,8 +165,8 @@ class Totals:
             yield (
                 f"{passed_s / self.extruding_s:.0%} {NOT_COMPENSATED}, from line "
                 f"{self.passed_line} on: its moves keep their own lines, because they lie between "
-                "STILLPATH_OFF and STILLPATH_ON, come after TUNING_TOWER, belong to a laser, move "
-                "other axes too, climb faster than Z can follow a stream (max_z_accel_mm_s2, "
-                "max_z_velocity_mm_s), take long for their length, or start where the position is "
-                "not known"
+                "STILLPATH_OFF and STILLPATH_ON, come after TUNING_TOWER, belong to a laser or "
+                "to a tool whose K is not known (put M900 K behind each T), move other axes too, "
+                "climb faster than Z can follow a stream (max_z_accel_mm_s2, max_z_velocity_mm_s), "
+                "take long for their length, or start where the position is not known"
             )

@@ -392,7 +392,8 @@ CLASSES = {
     "M900 K0": {"marlin": EventKind.LIMITS},  # as it is already: no stop
     "M495 X F10 T100": {"marlin": EventKind.HARMLESS},  # set, not begun
     "M496": {"marlin": EventKind.HARMLESS},
-    "M900 K0.05 T1": {"marlin": EventKind.HARMLESS},
+    "M900 K0.05 T1": {"marlin": EventKind.STOP},
+    "M900 K0 T1": {"marlin": EventKind.LIMITS},
     "M221 S90 T1": {"marlin": EventKind.HARMLESS},
     "M7": {"marlin": EventKind.STOP},
     "M102": {"marlin": EventKind.HARMLESS},  # Simplify3D's, beside M101 and M103

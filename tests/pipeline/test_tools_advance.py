@@ -1,10 +1,11 @@
-"""RepRapFirmware keeps one pressure advance for each extruder; streams have it off and on again."""
+"""Firmwares keep an advance for each extruder; streams have it off and on again."""
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
 
+from stillpath.models.machine import Machine
 from tests.compensating import compensated
 from tests.fuzz.machines import machine_of
 
@@ -49,3 +50,67 @@ def test_each_tool_keeps_its_own(tmp_path: Path, cache: Path) -> None:
     wanted = advances(_PRINT, machine.pressure_advance_s)
     assert len(wanted) == 7
     assert advances(written, machine.pressure_advance_s) == wanted
+
+
+def marlin(variant: str) -> Machine:
+    """Return a Marlin machine with linear advance, K0.03 at power-on."""
+    document = machine_of("marlin").model_dump(mode="json")
+    more = {"variant": variant, "linear_advance": True, "linear_advance_k_s": 0.03}
+    document["firmware"] |= more
+    return Machine.model_validate(document)
+
+
+def moved(text: str) -> list[list[str]]:
+    """Return each tool's lines, one list for every T."""
+    parts = re.split(r"(?m)^(?=T\d$)", text)
+    return [part.splitlines() for part in parts[1:]]
+
+
+_TOOLS = (
+    "G28\nG90\nM83\nG1 Z.3 F600\nT0\nM900 K0.05\nG1 X100 Y100 F6000\n"
+    + _SQUARE
+    + "T1\nM900 K0.1\nG1 X100 Y100 Z.3\n"
+    + _SQUARE
+    + "T0\nG1 X100 Y100 Z.3\n"
+    + _SQUARE
+)
+
+
+def advances_set(lines: list[str]) -> list[str]:
+    return [line for line in lines if line.startswith("M900")]
+
+
+def test_marlin_goes_back_to_the_advance_of_the_tool(tmp_path: Path, cache: Path) -> None:
+    _, text = compensated(_TOOLS, tmp_path, cache, marlin("2.0"), method="shaper:mzv")
+    *_, last = moved(text.decode())
+    assert advances_set(last) == ["M900 K0", "M900 K0.05"]
+
+
+def test_where_tools_may_share_the_advance_moves_wait_for_it(tmp_path: Path, cache: Path) -> None:
+    result, text = compensated(_TOOLS, tmp_path, cache, marlin("2.1"), method="shaper:mzv")
+    _, second, third = moved(text.decode())
+    assert advances_set(second) == ["M900 K0.1", "M900 K0", "M900 K0.1"]
+    assert third[:6] == ["T0", "G1 X100 Y100 Z.3", *_SQUARE.splitlines()]
+    assert any("M900 K" in warning for warning in result.warnings)
+    stated = _TOOLS + "M900 K0.05\n" + _SQUARE
+    _, text = compensated(stated, tmp_path, cache, marlin("2.1"), method="shaper:mzv")
+    assert advances_set(moved(text.decode())[-1]) == ["M900 K0.05", "M900 K0", "M900 K0.05"]
+
+
+def test_an_advance_that_is_set_by_tool_is_kept_by_tool(tmp_path: Path, cache: Path) -> None:
+    stated = "M900 T1 K0.2\n" + _TOOLS.replace("M900 K0.1\n", "")
+    result, text = compensated(stated, tmp_path, cache, marlin("2.1"), method="shaper:mzv")
+    assert result.pieces == 3
+    written = [advances_set(lines) for lines in moved(text.decode())]
+    assert written[1:] == [["M900 K0", "M900 K0.2"], ["M900 K0", "M900 K0.05"]]
+    # The firmware stands still where it sets it, so it does not stand in a stream.
+    inside = _TOOLS.replace(_SQUARE, _SQUARE + "M900 T1 K0.07\n" + _SQUARE, 1)
+    _, text = compensated(inside, tmp_path, cache, marlin("2.1"), method="shaper:mzv")
+    first = moved(text.decode())[0]
+    assert "M900 K0.05" in first[: first.index("M900 T1 K0.07")][-4:]
+
+
+def test_settings_read_again_are_those_of_all_tools(tmp_path: Path, cache: Path) -> None:
+    text = _TOOLS.replace("T0\nG1 X100", "M501\nG28\nT0\nG1 X100")
+    _, written = compensated(text, tmp_path, cache, marlin("2.1"), method="shaper:mzv")
+    assert advances_set(moved(written.decode())[-1]) == ["M900 K0", "M900 K0.03"]

@@ -11,6 +11,7 @@ import math
 from collections.abc import Mapping
 
 from stillpath.gcode import _slots as at
+from stillpath.gcode.commands import tool as other_tool
 from stillpath.gcode.dialect import Handler
 from stillpath.gcode.lexer import Command
 from stillpath.gcode.state import MachineState
@@ -33,6 +34,7 @@ __all__ = [
     "resonance_test",
     "retract_settings",
     "speed_factor",
+    "tool",
 ]
 
 _M205 = {
@@ -102,22 +104,55 @@ def corners_and_least_speeds(state: MachineState, command: Command) -> int:
 
 
 def linear_advance(state: MachineState, command: Command) -> int:
-    """M900: K from 0 to 10. The firmware waits for standstill where it changes."""
+    """M900: K from 0 to 10, of tool T or of the one in use.
+
+    The firmware waits for standstill where it changes. Each tool has its own K up to 2.1.1; since
+    2.1.2 they have one, unless the build has DISTINCT_E_FACTORS (module/planner.h, Marlin #24821).
+    A file that sets it for another tool is taken for one of a printer that has one for each.
+    """
     given = state.numbers(command, "KT")
     k = given.get("K")
     if {"L", "S"} & command.words.keys():
         # A second K to change over to (ADVANCE_K_EXTRA).
         state.warn("M900 with L or S: which K is in force is not known")
         return state.event(EventKind.UNKNOWN)
-    if k is None or _other_tool(state, given):
+    if k is None:
         return state.event(EventKind.HARMLESS)
     if not 0.0 <= k <= 10.0:
         state.warn(f"M900 K{k:g} is not between 0 and 10, and is ignored")
         return state.event(EventKind.HARMLESS)
-    if k == state.limit("linear_advance_k_s"):
+    used = int(state.i[at.I_TOOL])
+    named = int(given.get("T", used))
+    known = _advance_k_s(state, named)
+    state.factors[f"advance {named}"] = k
+    if named == used:
+        state.factors["advance"] = k
+        state.hold("linear advance", False)
+    else:
+        state.factors["advance by tool"] = 1.0
+    if k == known:
         # No stop; but a stream has K off, and there the line would switch it on.
         return state.event(EventKind.LIMITS)
-    return state.set_limits(command, {"linear_advance_k_s": k}, remember=False, kind=EventKind.STOP)
+    values = {"linear_advance_k_s": k} if named == used else {}
+    return state.set_limits(command, values, remember=False, kind=EventKind.STOP)
+
+
+def tool(state: MachineState, command: Command) -> int:
+    """T: another tool, which may have a K of its own; moves wait for M900 where it may or not."""
+    found = other_tool(state, command)
+    k, last = _advance_k_s(state, int(state.i[at.I_TOOL])), state.factors.get("advance")
+    firmware = state.machine.firmware
+    shared = (
+        isinstance(firmware, Marlin)
+        and firmware.variant == "2.1"
+        and firmware.linear_advance is not False
+        and "advance by tool" not in state.factors
+    )
+    # A stream that switches advance off and on again would set a wrong K for good.
+    state.hold("linear advance", shared and last is not None and last != k)
+    state.f[at.F_LIMITS + state.limits_names.index("linear_advance_k_s")] = k
+    state.note_limits()
+    return found
 
 
 def speed_factor(state: MachineState, command: Command) -> int:
@@ -206,7 +241,7 @@ def reset_origin(state: MachineState, _command: Command) -> int:
 
 
 def reset_limits(state: MachineState, command: Command) -> int:
-    """M501 and M502: the settings that are stored, or the build's own.
+    """M501 and M502: the settings that are stored, or the build's own, of all tools.
 
     The machine's document gives the stored ones (power-on); the build's are unknown.
     """
@@ -216,6 +251,8 @@ def reset_limits(state: MachineState, command: Command) -> int:
     state.settle()
     state.f[at.F_LIMITS : at.F_LIMITS + len(row)] = row
     state.note_limits()
+    state.factors = {k: v for k, v in state.factors.items() if not k.startswith("advance")}
+    state.hold("linear advance", False)
     state.warn(f"{command.name}: from here on the position is not known until the printer homes")
     state.forget(origin=True)
     return state.event(EventKind.UNKNOWN)
@@ -276,6 +313,12 @@ def not_modelled(kind: EventKind, why: str, *, origin: bool = True) -> Handler:
         return state.event(kind)
 
     return handle
+
+
+def _advance_k_s(state: MachineState, tool: int) -> float:
+    """Return a tool's K of linear advance; before M900 the machine's [s]."""
+    column = state.limits_names.index("linear_advance_k_s")
+    return state.factors.get(f"advance {tool}", float(state.initial_limits[column]))
 
 
 def _other_tool(state: MachineState, given: Mapping[str, float]) -> bool:

@@ -18,7 +18,6 @@ from stillpath.gcode.commands import (
     home,
     host_command,
     retract,
-    tool,
 )
 from stillpath.gcode.dialect import (
     Action,
@@ -56,7 +55,7 @@ MOTION: dict[str, Word] = {
     "M220": commands.speed_factor,
     "M221": commands.extrude_factor,
     "M486": cancel_object,
-    "T": tool,
+    "T": commands.tool,
     "@": host_command,
 }
 

@@ -14,7 +14,6 @@ from stillpath.gcode import _slots as at
 from stillpath.gcode._motion_kernels import set_feed
 from stillpath.gcode.commands import retract
 from stillpath.gcode.commands import tool as other_tool
-from stillpath.gcode.firmware.marlin.commands import reset_limits
 from stillpath.gcode.lexer import Command
 from stillpath.gcode.state import MachineState, Saved
 from stillpath.gcode.types import EventKind
@@ -32,7 +31,6 @@ __all__ = [
     "pop_state",
     "pressure_advance",
     "push_state",
-    "reset",
     "retract_or_offsets",
     "retract_settings",
     "select_plane",
@@ -111,12 +109,6 @@ def pressure_advance(state: MachineState, command: Command) -> int:
     state.factors.update((f"advance {extruder}", given["S"]) for extruder in extruders)
     values = {"pressure_advance_s": given["S"]} if used in extruders else {}
     return state.set_limits(command, values, remember=False, kind=EventKind.SHAPER)
-
-
-def reset(state: MachineState, command: Command) -> int:
-    """M501 and M502, of all tools."""
-    state.factors = {k: v for k, v in state.factors.items() if not k.startswith("advance ")}
-    return reset_limits(state, command)
 
 
 def tool(state: MachineState, command: Command) -> int:

@@ -16,7 +16,7 @@ from stillpath.gcode.dialect import (
     Word,
     words,
 )
-from stillpath.gcode.firmware.marlin.commands import filament_area, not_modelled
+from stillpath.gcode.firmware.marlin.commands import filament_area, not_modelled, reset_limits
 from stillpath.gcode.firmware.reprapfirmware import commands
 from stillpath.gcode.types import EventKind
 from stillpath.gcode.workspaces import machine_space, save_place, select_workspace
@@ -111,7 +111,7 @@ STEPS: dict[str, Word] = {
             EventKind.UNKNOWN, "from here on the position is not known until the printer homes"
         ),
     ),
-    **words("M501 M502", commands.reset),
+    **words("M501 M502", reset_limits),
     "M563": commands.define_tool,
     "M92": not_modelled(EventKind.STOP, "steps per mm are taken from the machine"),
     "M593": EventKind.SHAPER,
