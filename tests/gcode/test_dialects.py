@@ -420,9 +420,12 @@ CLASSES = {
         line: {"reprapfirmware": EventKind.STOP}
         for line in (
             *("M17", "M906 X800", "M913 X50", "G17", "M302 P1", "M92 X80", "M190 S{var.bed}"),
-            *("G10 L2 P1 X5", "G10 L20 Z0"),
+            *("G10 L2 P1 X5", "G10 L20 Z0", "M592 D0 A0.01"),
         )
     },
+    "M218 T1 X20 Y0.1": {"marlin": EventKind.HARMLESS},
+    "M206": {"marlin": EventKind.HARMLESS},
+    "M567 P0 E0.5:0.5": {"reprapfirmware": EventKind.HARMLESS},
     "G10 L20 P2": {"reprapfirmware": EventKind.HARMLESS},
     # Held back in a stream, a further word would be lost.
     "M201 X500": dict.fromkeys(("marlin", "reprapfirmware"), EventKind.LIMITS),
@@ -443,6 +446,35 @@ CLASSES = {
     "M117 G1 X5 ; text": dict.fromkeys(ALL, EventKind.HARMLESS),
     "M106 S255 ; G1": dict.fromkeys(ALL, EventKind.HARMLESS),
 }
+
+
+@pytest.mark.parametrize(
+    ("line", "name", "known"),
+    [
+        ("T1", "marlin", 7),
+        ("M218 T1 X20", "marlin", 7),
+        ("M206 Z-0.1", "marlin", 3),
+        ("M206 X1 Y1", "reprapfirmware", 4),
+        ("G10 P1 X20 Y0.1", "reprapfirmware", 7),
+        ("T1\nG10 P1 Z-0.1", "reprapfirmware", 7),
+        ("M569 P0 D3", "reprapfirmware", 7),
+        ("M561", "reprapfirmware", 7),
+        ('M375 P"heightmap.csv"', "reprapfirmware", 7),
+        ("M556 S100 X0.1", "reprapfirmware", 7),
+        ("M350 X16", "reprapfirmware", 0),
+    ],
+)
+def test_the_next_coordinates_tell_the_place(read, line: str, name: str, known: int) -> None:
+    """Offsets of tools, a bent bed: coordinates still count from the same place."""
+    text = f"G28\nT0\nG1 X9 Y9 Z1 F600\n{line}\nG1 X8 Y8 Z2\nG1 X7 Y7 Z1\n"
+    assert read(text, name)[0].moves.known[-1] == known
+
+
+def test_the_offset_of_another_tool_moves_nothing(read) -> None:
+    """RepRapFirmware's G10 of a tool that is not in use."""
+    block, _ = read("T0\nG1 X9 F600\nG10 P1 X5\nG10 P0 X5\nG10 X5\n", "reprapfirmware")
+    unknown, stop = EventKind.UNKNOWN, EventKind.STOP
+    assert block.events.kind.tolist() == [unknown, stop, unknown, unknown]
 
 
 def test_a_place_that_is_told_is_no_motion(read) -> None:

@@ -26,6 +26,7 @@ __all__ = [
     "end_motion_mode",
     "extrude_factor",
     "filament_area",
+    "home_offset",
     "linear_advance",
     "not_modelled",
     "park_tool",
@@ -228,6 +229,17 @@ def retract_settings(state: MachineState, command: Command) -> int:
             changes[name] = abs(given[letter]) / (60.0 if letter == "F" else 1.0)
     state.change_retraction(**changes)
     return state.event(EventKind.MODE)
+
+
+def home_offset(state: MachineState, command: Command) -> int:
+    """M206: the origins of the axes that it names are elsewhere; how far is not known."""
+    axes = sum(1 << k for k, axis in enumerate("XYZ") if axis in command.words)
+    if not axes:
+        return state.event(EventKind.HARMLESS)
+    named = " ".join(axis for k, axis in enumerate("XYZ") if axes >> k & 1)
+    state.warn(f"M206: from here on the position of {named} is not known until the printer homes")
+    state.forget(axes, origin=True)
+    return state.event(EventKind.UNKNOWN)
 
 
 def reset_origin(state: MachineState, _command: Command) -> int:

@@ -146,9 +146,10 @@ def retract_or_offsets(state: MachineState, command: Command) -> int:
     if "L" in words and state.numbers(command, "L").get("L") != 1.0:
         return _workspace(state, command)
     if any(axis in words for axis in "XYZUVWABCD"):
-        state.warn("G10 changes a tool's offsets; the position is not known until homing")
-        state.forget(origin=True)
-        return state.event(EventKind.UNKNOWN)
+        number = state.numbers(command, "P").get("P", float(state.i[at.I_TOOL]))
+        other = state.tool_known and number != float(state.i[at.I_TOOL])
+        # Of the tool in use they move the origin; the next coordinates tell the place again.
+        return state.event(EventKind.STOP if other else EventKind.UNKNOWN)
     if any(letter in words for letter in "LPRS"):
         return state.event(EventKind.HARMLESS)
     return retract(state, command)

@@ -16,7 +16,12 @@ from stillpath.gcode.dialect import (
     Word,
     words,
 )
-from stillpath.gcode.firmware.marlin.commands import filament_area, not_modelled, reset_limits
+from stillpath.gcode.firmware.marlin.commands import (
+    filament_area,
+    home_offset,
+    not_modelled,
+    reset_limits,
+)
 from stillpath.gcode.firmware.reprapfirmware import commands
 from stillpath.gcode.types import EventKind
 from stillpath.gcode.workspaces import machine_space, save_place, select_workspace
@@ -81,37 +86,38 @@ STEPS: dict[str, Word] = {
         "G31 M20 M21 M22 M27 M29 M30 M36 M36.1 M38 M39 M42 M73 M80 M85 M102 M104 M105 M106 "
         "M107 M108 M110 M111 M114 M115 M117 M118 M119 M122 M140 M141 M143 M144 M201.1 M202 M260 "
         "M261 M280 M292 M300 M301 M304 M305 M307 M308 M309 M374 M404 M407 M408 M409 M450 M470 M471 "
-        "M472 M500 M503 M540 M550 M551 M552 M553 M554 M555 M557 M558 M564 M568 M570 M571 M573 M575 "
-        "M576 M581 M586 M586.4 M587 M587.1 M587.2 M588 M589 M591 M672 M851 M905 M911 M912 M915 "
-        "M929 M950 M955 M956 M998",
+        "M472 M500 M503 M540 M550 M551 M552 M553 M554 M555 M557 M558 M564 M567 M568 M570 M571 M573 "
+        "M575 M576 M581 M586 M586.4 M587 M587.1 M587.2 M588 M589 M591 M672 M851 M905 M911 M912 "
+        "M915 M929 M950 M955 M956 M998",
         EventKind.HARMLESS,
     ),
     # Come to rest, wait, go on from the same place.
     **words(
-        "M17 M116 M150 M190 M191 M290 M302 M303 M400 M577 M578 M595 M598 M906 M913 M917 M918",
+        "M17 M116 M150 M190 M191 M290 M302 M303 M400 M577 M578 M592 M595 M598 M906 M913 M917 M918",
         EventKind.STOP,
     ),
     **words("M3 M4", cutter(EventKind.HARMLESS)),
     "M5": cutter(EventKind.STOP),
     "M109": commands.heat_and_wait,
-    # Homing, probing, macros, pauses, motors off, other files and queues, events: the place or the
-    # state is lost.
+    # Homing, probing, macros, pauses, motors off, other files and queues, events, what bends the
+    # bed or the axes: the place or the state is lost, and the next coordinates tell it.
     **words(
         "G27 G29 G30 G32 G38 G38.2 G38.3 G38.4 G38.5 M0 M1 M2 M18 M23 M24 M25 M26 M28 M32 M37 M81 "
-        "M84 M98 M99 M112 M125 M208 M226 M291 M376 M401 M402 M505 M559 M560 M562 M574 M582 M585 "
+        "M84 M98 M99 M112 M125 M208 M226 M291 M375 M376 M401 M402 M425 M505 M556 M559 M560 M561 "
+        "M562 M569 M569.1 M569.2 M569.3 M569.4 M569.5 M569.6 M569.7 M569.8 M569.9 M574 M582 M585 "
         "M594 M596 M597 M599 M600 M601 M606 M673 M701 M702 M703 M916 M951 M952 M953 M954 M957 M970 "
         "M970.1 M970.2 M970.3 M997 M999",
         EventKind.UNKNOWN,
     ),
     # The coordinates count from somewhere else.
     **words(
-        "G68 G69 G93 G94 M206 M350 M375 M425 M556 M561 M567 M569 M569.1 M569.2 M569.3 M569.4 "
-        "M569.5 M569.6 M569.7 M569.8 M569.9 M579 M584 M592 M665 M666 M667 M669 M671 M674 M675",
+        "G68 G69 G93 G94 M350 M579 M584 M665 M666 M667 M669 M671 M674 M675",
         not_modelled(
             EventKind.UNKNOWN, "from here on the position is not known until the printer homes"
         ),
     ),
     **words("M501 M502", reset_limits),
+    "M206": home_offset,
     "M563": commands.define_tool,
     "M92": not_modelled(EventKind.STOP, "steps per mm are taken from the machine"),
     "M593": EventKind.SHAPER,
