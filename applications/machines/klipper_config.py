@@ -224,17 +224,30 @@ def _printer(config: PrinterConfig) -> list[Fact]:
 
 
 def _travel(config: PrinterConfig) -> list[Fact]:
-    return [
-        fact
-        for axis in "xyz"
-        if f"stepper_{axis}" in config.sections
-        for fact in _numbers(
-            config,
-            f"stepper_{axis}",
-            ("position_min", f"travel.{axis}.min_mm", 0.0),
-            ("position_max", f"travel.{axis}.max_mm", None),
-        )
-    ]
+    """Return the ends of each axis; of one with two carriages, from the first's to the second's.
+
+    Klipper holds each carriage to its own (klippy/kinematics/cartesian.py, idex_modes.py, 2026-08).
+    """
+    found = []
+    for axis in "xyz":
+        sections = [f"stepper_{axis}"]
+        if (config.text("dual_carriage", "axis") or "").lower() == axis:
+            sections.append("dual_carriage")
+        ends = [
+            _numbers(
+                config,
+                section,
+                ("position_min", f"travel.{axis}.min_mm", 0.0),
+                ("position_max", f"travel.{axis}.max_mm", None),
+            )
+            for section in sections
+            if sections[0] in config.sections
+        ]
+        if ends:
+            lows, highs = zip(*ends, strict=True)
+            found.append(min(lows, key=lambda fact: float(fact.value)))
+            found.append(max(highs, key=lambda fact: float(fact.value)))
+    return found
 
 
 def _extruder(config: PrinterConfig) -> list[Fact]:

@@ -354,6 +354,25 @@ def test_a_smoother_has_a_frequency_of_its_own(store: MachineStore, config: Path
     assert not differences(machine, read_printer_config(config))
 
 
+def test_the_travel_is_that_of_both_carriages(store: MachineStore, config: Path):
+    """A second tool prints where the first one's carriage does not go."""
+    second = "[dual_carriage]\naxis: X\nposition_min: 40\nposition_max: 310\n[stepper_y]"
+    config.write_text(
+        CONFIG.replace("[stepper_y]", second).replace("kinematics: corexy", "kinematics: cartesian")
+    )
+    assert machines("from-config", config, "--name", "mine") == 0
+    machine = store.current("mine").machine
+    assert [(axis.min_mm, axis.max_mm) for axis in machine.travel.values()] == [
+        (-2.0, 310.0),
+        (0.0, 255.0),
+        (0.0, 240.0),
+    ]
+    assert not differences(machine, read_printer_config(config))
+    config.write_text(config.read_text().replace("position_max: 310", "position_max: 320"))
+    (difference,) = differences(machine, read_printer_config(config))
+    assert (difference.section, difference.option) == ("dual_carriage", "position_max")
+
+
 @pytest.mark.parametrize("hertz", ["inf", "nan", "1e101", "501"])
 def test_resonances_that_are_none(store: MachineStore, config: Path, capsys, hertz: str):
     assert machines("from-config", config, "--name", "mine", "--fx", hertz) == 2
