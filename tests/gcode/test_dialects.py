@@ -454,6 +454,7 @@ CLASSES = {
         ("T1", "marlin", 7),
         ("M218 T1 X20", "marlin", 7),
         ("M206 Z-0.1", "marlin", 3),
+        ("M852 S0.002", "marlin", 7),
         ("M206 X1 Y1", "reprapfirmware", 4),
         ("G10 P1 X20 Y0.1", "reprapfirmware", 7),
         ("T1\nG10 P1 Z-0.1", "reprapfirmware", 7),
