@@ -294,6 +294,26 @@ def test_older_klippers_stand_at_every_pressure_advance(golden_machine: Machine)
     assert block.events.dwell_s[0] == pytest.approx(0.04)
 
 
+def test_a_pressure_advance_that_may_stop_a_stream_is_told(golden_machine: Machine) -> None:
+    """Adaptive pressure advance changes it between the lines of a print."""
+    told = {"stopping_macros": ("SET_PRESSURE_ADVANCE",)}
+    older = golden_machine.firmware.model_copy(update=told)
+    text = "SET_PRESSURE_ADVANCE ADVANCE=.0{}\n"
+    print_ = f"{text.format(5)}G28\nG1 X5 Y5 F600\n{text.format(4)}"
+
+    def told_of(written: str, **facts: object) -> bool:
+        update = {"pressure_advance_s": 0.05, **facts}
+        reader = Interpreter(golden_machine.model_copy(update=update))
+        reader.push(written.encode())
+        return any("stopping_macros" in warning for warning in reader.warnings)
+
+    assert told_of(print_)
+    assert not told_of(print_, firmware=older)
+    # Where the printer stands anyway, or the slicer sets it once.
+    assert not told_of(print_.replace("G1 X5 Y5 F600", "T1"))
+    assert not told_of(print_.replace(text.format(5), ""))
+
+
 def test_macros_that_the_machine_declares(wary_machine: Machine) -> None:
     firmware = wary_machine.firmware.model_copy(
         update={

@@ -33,6 +33,11 @@ _MOST_SMOOTH_S = 0.2
 _MOST_REACH_S = 1.0
 _KINDS = tuple(SHAPERS)
 _SET = ("ADVANCE ", "SMOOTH_TIME ")
+_MAY_STOP = (
+    "SET_PRESSURE_ADVANCE in the middle of the print: Klipper before 2025-09, as most vendors' is, "
+    "and Kalico stop there, and streams with them; if yours is one of these, put "
+    "SET_PRESSURE_ADVANCE among the machine's stopping_macros (firmware section)"
+)
 _EXTRUDER = re.compile(r"extruder(\d{0,2})")
 
 
@@ -48,11 +53,14 @@ def pressure_advance(state: MachineState, command: Command) -> int:
             return state.event(EventKind.STOP, 2.0 * before_s)
         extruder = int(found[1] or 0)
     smooth_s = _extruder_smooth_s(state, extruder)
+    again = f"ADVANCE {extruder}" in state.factors
     for key in ("ADVANCE", "SMOOTH_TIME"):
         if key in given:
             state.factors[f"{key} {extruder}"] = _number(given[key])
     always = command.name in map(str.upper, state.firmware.stopping_macros)
     if _extruder_smooth_s(state, extruder) == smooth_s and not always:
+        if again and state.i[at.I_KNOWN] & 3 == 3:
+            state.warn(_MAY_STOP)
         return state.event(EventKind.HARMLESS)
     return state.event(EventKind.STOP, before_s + _ahead_s(state))
 
