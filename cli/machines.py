@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -393,8 +394,9 @@ def from_m503(
     from stillpath.models.user_files import as_utf8, read_bytes
 
     content = read_bytes(file, _LARGEST_LOG_BYTES, "keep M503's answer only")
+    text = as_utf8(content).decode(errors="replace")
     machine = marlin_settings.machine_from_m503(
-        as_utf8(content).decode(errors="replace"),
+        text,
         file.name,
         _stated(made),
         travel_mm=marlin_settings.read_travel(travel),
@@ -410,14 +412,22 @@ def from_m503(
         expected=0,
     )
     print_revision(revision)
-    said = {field.partition("=")[0].strip() for field in fields or ()}
+    for line in [*_what_m503_leaves(machine, text, fields or ()), *_refused(machine)]:
+        typer.echo(line)
+
+
+def _what_m503_leaves(machine: Machine, text: str, fields: Sequence[str]) -> Iterator[str]:
+    """Yield what an answer to M503 does not say, or says of other tools."""
+    from stillpath.applications.machines import marlin_settings
+
+    said = {field.partition("=")[0].strip() for field in fields}
     assumed = [
         f"{field}={str(value).lower()}"
         for field, value in marlin_settings.ASSUMED.items()
         if field not in said
     ]
     if assumed:
-        typer.echo(f"assumed, for M503 does not say it: {', '.join(assumed)}; --set says otherwise")
+        yield f"assumed, for M503 does not say it: {', '.join(assumed)}; --set says otherwise"
     section = machine.firmware.model_dump(mode="json", exclude_unset=True)
     short = [
         f"{place}={value:g}"
@@ -425,9 +435,12 @@ def from_m503(
         if place not in said
     ]
     if short:
-        typer.echo(f"rounded by M503: {', '.join(short)}; give the exact values with --set")
-    for line in _refused(machine):
-        typer.echo(line)
+        yield f"rounded by M503: {', '.join(short)}; give the exact values with --set"
+    if differing := marlin_settings.of_other_tools(text):
+        yield (
+            f"other tools differ: {', '.join(differing)}; the machine has the first tool's, which "
+            "files set behind every stretch: put M900 K behind each T, state the lower limits"
+        )
 
 
 def _day(text: str) -> Any:

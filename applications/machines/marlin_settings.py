@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from pydantic import ValidationError
@@ -25,6 +25,7 @@ __all__ = [
     "firmware_section",
     "looks_like_m503",
     "machine_from_m503",
+    "of_other_tools",
     "read_travel",
     "rounded",
     "with_m503",
@@ -229,6 +230,20 @@ def _unrounded(said: dict[str, Any], before: dict[str, Any]) -> None:
             inner[field] = exact[place]
 
 
+def of_other_tools(text: str) -> list[str]:
+    """Return settings of M503 in which another tool differs from the first, as it prints them."""
+    first, found = _commands(text), []
+    for command, words in _lines(text):
+        tool = (words.pop("T", None) or 0) if command in _PER_TOOL else 0
+        if tool > 0:
+            found += [
+                f"{command} T{tool:.0f} {letter}{value:g}"
+                for letter, value in words.items()
+                if value is not None and value != first.get(command, {}).get(letter)
+            ]
+    return found
+
+
 def read_travel(text: str) -> tuple[float, float, float]:
     """Parse a travel such as ``235x235x250``, in mm."""
     parts = re.split(r"[x,]", text.strip().lower())
@@ -260,18 +275,20 @@ def _set_fields(section: dict[str, Any], fields: Sequence[str]) -> None:
             inner[last] = value.strip()
 
 
-def _commands(text: str) -> dict[str, _Words]:
-    """Return each command's words; M593 stands under ``M593 X``, ``M593 Y``, ..."""
-    found: dict[str, _Words] = {}
+def _lines(text: str) -> Iterator[tuple[str, _Words]]:
+    """Yield the commands of a reply in order, each with its words."""
     for line in text.splitlines():
         if len(line) > _LONGEST_LINE or (match := _COMMAND.search(line)) is None:
             continue
-        if ";" in line[: match.start()]:
-            continue
-        command = match[1]
-        words: _Words = {
-            letter: float(value) if value else None for letter, value in _WORD.findall(match[2])
-        }
+        if ";" not in line[: match.start()]:
+            found = _WORD.findall(match[2])
+            yield match[1], {letter: float(value) if value else None for letter, value in found}
+
+
+def _commands(text: str) -> dict[str, _Words]:
+    """Return each command's words; M593 stands under ``M593 X``, ``M593 Y``, ..."""
+    found: dict[str, _Words] = {}
+    for command, words in _lines(text):
         if command in _PER_TOOL and (words.pop("T", None) or 0) > 0:
             continue
         names = [command]

@@ -66,6 +66,17 @@ def stored(capsys: pytest.CaptureFixture[str]):
     return read_machine(capsys.readouterr().out.encode(), "mine")
 
 
+def test_what_other_tools_have_is_told(make) -> None:
+    """The document has one value of each; what a stream restores is that."""
+    _, out, _ = make(M503)
+    assert "other tools differ: M900 T1 K0.8; " in out
+    same = M503.replace("K0.80", "K0.05").replace("Recv: ok", "Recv: M203 T1 E25.00\nRecv: ok")
+    _, out, _ = make(same, "--name", "same")
+    assert "other tools" not in out
+    _, out, _ = make(same.replace("T1 E25", "T1 E45"), "--name", "faster")
+    assert "other tools differ: M203 T1 E45; " in out
+
+
 def test_what_m503_says_is_in_the_machine(make, capsys) -> None:
     code, out, err = make(
         M503, "--set", "min_steps_per_segment=1", "--set", "variant=2.0", "--fy", "29"
