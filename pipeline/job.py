@@ -299,8 +299,7 @@ class Job:
 
     def _piece(self, piece: Piece) -> None:
         delay_s = self.delay_s
-        self._sum.pieces += 1
-        self._sum.moves += len(piece.moves)
+        self._sum.begin_piece(piece)
         self._check_end(piece, piece.phases.duration_s)
         self._sum.original_s += piece.phases.duration_s
         lines = int(piece.moves.line[0]), int(piece.moves.line[-1])

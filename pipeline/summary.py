@@ -30,6 +30,8 @@ __all__ = ["SHAPER_IS_BETTER", "Summary"]
 
 SHAPER_IS_BETTER = "The firmware's own shaper would serve this file better"
 """Beginning of the warning."""
+_ONE_HEAD = "single_extruder_multi_material"
+"""Setting of PrusaSlicer and its forks: filaments change, and the head is the same."""
 _AS_GOOD = 1.2
 """Ratio to the shaper's error from which a file that imitates that shaper is called worse."""
 
@@ -80,7 +82,7 @@ class Summary:
             slicer_time_s=facts.estimate_s,
             original_bytes=size,
             **self.totals.figures(compensates=self.writer is not None),
-            warnings=list(self._warnings(channels)),
+            warnings=list(self._warnings(channels, facts)),
             notes=list(self._notes()),
             confirmation=confirmation_text(self.machine) if self.writer is not None else "",
             stages=clock.stages(),
@@ -107,7 +109,7 @@ class Summary:
             )
         return channels
 
-    def _warnings(self, channels: list[Channel]) -> Iterator[str]:
+    def _warnings(self, channels: list[Channel], facts: SlicerFacts) -> Iterator[str]:
         typed = None
         if self.choice is not None and self.totals.compensated_share > 0.0:
             typed = stated_note(self.machine, self.shaper)
@@ -123,6 +125,7 @@ class Summary:
         if self.writer is not None:
             yield from self.writer.shaper_warnings()
             yield from self.totals.left_alone()
+            yield from self._other_heads(facts)
         if self.budget is not None:
             budget, pairs = self.budget
             yield from budget.warnings(pairs.sums(), self.reader.feature_names)
@@ -140,6 +143,16 @@ class Summary:
                 )
         if self.budget is not None:
             yield self.budget[1].note
+
+    def _other_heads(self, facts: SlicerFacts) -> Iterator[str]:
+        """Yield a warning where several tools print that may be heads of their own."""
+        tools = sorted(self.totals.tools)
+        if len(tools) > 1 and facts.settings.get(_ONE_HEAD) != "1":
+            yield (
+                f"Tools {', '.join(map(str, tools))} print, and all are compensated and predicted "
+                "as the one that was measured. Where each is a head of its own (tool changer, two "
+                "carriages), leave the others as sliced, between STILLPATH_OFF and STILLPATH_ON"
+            )
 
     def _outdone(self, rms_um: dict[str, float], least_ratio: float) -> Iterator[str]:
         """Yield a warning where the firmware's shaper, without compensation, would do better."""

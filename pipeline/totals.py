@@ -33,9 +33,17 @@ class Totals:
         self.left_out_s = self.left_out_extruding_s = self.rippling_s = 0.0
         self.gap_count = 0
         self.put_back: list[PutBack] = []
+        self.tools: set[int] = set()
+        """Those that print in pieces."""
         self.warnings: list[str] = []
         self.newline = True
         self.jumped = True
+
+    def begin_piece(self, piece: Piece) -> None:
+        """Count a piece of the file."""
+        self.pieces += 1
+        self.moves += len(piece.moves)
+        self.tools.update(np.unique(piece.moves.tool[piece.moves.prints]).tolist())
 
     def add_piece(self, made: CompensatedPiece, executed: Phases, gap: np.ndarray) -> None:
         """Add a piece as written, and the distance of its motion from its command."""

@@ -114,3 +114,18 @@ def test_settings_read_again_are_those_of_all_tools(tmp_path: Path, cache: Path)
     text = _TOOLS.replace("T0\nG1 X100", "M501\nG28\nT0\nG1 X100")
     _, written = compensated(text, tmp_path, cache, marlin("2.1"), method="shaper:mzv")
     assert advances_set(moved(written.decode())[-1]) == ["M900 K0", "M900 K0.03"]
+
+
+def test_several_heads_are_told(tmp_path: Path, cache: Path) -> None:
+    """All are compensated with the model of one."""
+
+    def told(text: str) -> bool:
+        result, _ = compensated(text, tmp_path, cache, method="shaper:mzv")
+        return any("Tools 0, 1 print" in warning for warning in result.warnings)
+
+    both = _TOOLS.replace("M900", ";")
+    assert told(both)
+    assert not told(both + "; single_extruder_multi_material = 1\n")
+    assert not told(
+        both.replace("T1\n", ";STILLPATH_OFF\nT1\n").replace("T0\n", ";STILLPATH_ON\nT0\n")
+    )
