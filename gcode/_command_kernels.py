@@ -28,6 +28,7 @@ from stillpath.gcode._slots import (
     I_EVENTS,
     I_FACTOR_DEFAULT,
     I_KNOWN,
+    I_MACROS,
     I_ORIGIN_KNOWN,
     I_ORIGIN_RULE,
     I_PLANE,
@@ -75,6 +76,7 @@ def execute(action: int, w: Any, mask: int, f: Any, i: Any, rows: Any, tables: A
         if action == _UNKNOWN:
             settle(f, i, rows)
             i[I_KNOWN] = 0
+            i[I_MACROS] += 1
         put_event(i, rows, action)
         return OK
     if action == _MOVE:

@@ -37,6 +37,7 @@ from stillpath.gcode._slots import (
     I_LAYER,
     I_LINE,
     I_LONGEST,
+    I_MACROS,
     I_MODAL_WORDS,
     I_MOTION,
     I_MOVES,
@@ -98,6 +99,7 @@ def recall(buf: Any, start: int, stop: int, f: Any, i: Any, rows: Any, tables: A
         if what == MEMO_EVENT:
             kind = _UNKNOWN
             i[I_KNOWN] = 0
+            i[I_MACROS] += 1
         elif what == MEMO_LAYER:
             i[I_LAYER] += 1
         elif what == MEMO_FEATURE:

@@ -79,7 +79,8 @@ I_HOLD = 44  # every command is Python's: it may not be carried out at all
 I_APART = 45  # not every move of the rows starts where the one before it ends
 I_OBJECTS = 46  # objects that were named so far
 I_ARC_CIRCLES = 47  # P of an arc adds circles
-I_SIZE = 48
+I_MACROS = 48  # lines so far that may have been macros, or moved the head unseen
+I_SIZE = 49
 
 # Rows of the integer columns: of moves (M_) and of events (E_), each sort of number by itself.
 M_LINE, M_START, M_STOP, E_MOVE, E_LINE, E_START, E_STOP = range(7)

@@ -32,10 +32,10 @@ def home(state: MachineState, command: Command) -> int:
     """G28."""
     axes = sum(1 << k for k, axis in enumerate("XYZ") if axis in command.words) or 0b111
     state.home(axes, state.firmware.home_mm)
-    known = int(state.i[at.I_KNOWN])
+    kept = state.i[[at.I_KNOWN, at.I_MACROS]]
     status = state.event(EventKind.UNKNOWN)
     state.settle()
-    state.i[at.I_KNOWN] = known
+    state.i[[at.I_KNOWN, at.I_MACROS]] = kept
     return status
 
 
@@ -62,16 +62,20 @@ def no_retraction(state: MachineState, command: Command) -> int:
 def retract(state: MachineState, command: Command) -> int:
     """G10 and G11: a move of E, and a hop of Z, that the G-code's coordinates do not see.
 
-    RepRapFirmware has them as M103 and M101 too. Repeated ones are passed over. Z is lifted after
-    the retraction and lowered before filament comes back (Marlin fwretract.cpp 2.0.x;
-    RepRapFirmware GCodes.cpp RetractFilament 3.5).
+    RepRapFirmware has them as M103 and M101 too. Repeated ones are passed over. Behind a macro,
+    which may retract, the first one may be no repeated one: it counts as a move, where streams
+    rest. Z is lifted after the retraction and lowered before filament comes back (Marlin
+    fwretract.cpp 2.0.x; RepRapFirmware GCodes.cpp RetractFilament 3.5).
     """
     facts = state.retraction
     if facts is None:
         return state.event(state.dialect.otherwise(command.name))
     retracting = command.name in ("G10", "M103")
+    has_macros = state.dialect.extended_commands or state.dialect.expressions
     tool = 0 if state.dialect.extended_commands else int(state.i[at.I_TOOL])
-    if retracting == state.retracted.get(tool, False):
+    macros = int(state.i[at.I_MACROS]) if has_macros else 0
+    certain = state.retracted_at.get(tool, 0) == macros
+    if certain and retracting == state.retracted.get(tool, False):
         return state.event(EventKind.MODE)
     f = state.f
     scaled = state.dialect.retraction_scaled
@@ -103,7 +107,7 @@ def retract(state: MachineState, command: Command) -> int:
         state.hop_mm = max(0.0, state.hop_mm + hop)
         # A shifted origin of Z: the G-code's Z stays what it was.
         state.note_modal()
-    state.retracted[tool] = retracting
+    state.retracted[tool], state.retracted_at[tool] = retracting, macros
     return state.moved(status)
 
 

@@ -108,7 +108,8 @@ class MachineState:
         facts = self.firmware.retraction
         self.retraction = None if facts is None else Retraction.of(facts)
         self.retracted: dict[int, bool] = {}
-        """By tool; Klipper has one state for all."""
+        self.retracted_at: dict[int, int] = {}
+        """By tool, and I_MACROS when that was known; Klipper has one state for all."""
         self.hop_mm = 0.0
         self.factors: dict[str, float] = {}
         self.macro_ran = False
@@ -171,6 +172,7 @@ class MachineState:
         """Write the line in hand as an event."""
         if kind == EventKind.UNKNOWN:
             self.forget()
+            self.i[at.I_MACROS] += 1
         put_event(self.i, self.rows, int(kind))
         if dwell_s:
             self.settle()

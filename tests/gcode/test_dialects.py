@@ -182,7 +182,8 @@ CASES = {
     ),
     "retraction of each tool": (
         "M83\nT0\nG1 X1 E5 F600\nG10\nT1\nG10\nG11\nG11\n",
-        {"klipper": (1, 0, 0, 5), **same(("marlin", "reprapfirmware"), 1, 0, 0, 4.2)},
+        # Klipper's T1 is a macro, and may give back what was retracted.
+        same(("klipper", "marlin", "reprapfirmware"), 1, 0, 0, 4.2),
     ),
     "volumetric": (
         f"M83\nM200 D2\nG1 X1 E{math.pi} F600\n",

@@ -342,6 +342,17 @@ def test_firmware_retraction(golden_machine: Machine) -> None:
     assert block.moves.known.tolist() == [7, 0, 7, 0, 7]
 
 
+@pytest.mark.parametrize("macro", ["START", "PAUSE", "START\nPAUSE\nSTART"])
+def test_behind_a_macro_filament_may_be_retracted(macro: str, golden_machine: Machine) -> None:
+    """So a stream rests there: G11 would stop it in motion."""
+    told = golden_machine.firmware.model_copy(update={"unknown_commands": "unknown"})
+    machine = golden_machine.model_copy(update={"firmware": told})
+    block = run(f"G11\nG28\nG11\n{macro}\nG1 X5 F6000\nG11\nG1 X6\nG11\nG1 X7\n", machine)
+    assert block.moves.end_mm[:, 0].tolist() == [5.0, 5.0, 6.0, 7.0]
+    assert block.moves.end_mm[1, 3] - block.moves.end_mm[0, 3] == pytest.approx(0.8)
+    assert kinds(block)[:: len(block.events) - 1] == [EventKind.MODE] * 2
+
+
 def test_states_and_offsets(golden_machine: Machine) -> None:
     block = run(
         "G28\nG1 X5 Y5 E1 F6000\nSAVE_GCODE_STATE NAME=a\nG91\nG1 X5 E2 F60\n"
