@@ -174,7 +174,8 @@ class Search:
     def drawn(self, accepted: Sequence[Candidate], scatter: Scatter) -> list[Candidate]:
         """Return fits to resampled spectra."""
         whitening = self._whitening(accepted, scatter)
-        root = np.linalg.inv(whitening)
+        enlarged = self._excess(accepted[0], scatter)
+        root = enlarged * np.linalg.cholesky(scatter.drifted().covariance(self.model))
         likely = np.exp(-0.25 * (np.array([c.cost for c in accepted]) - accepted[0].cost))
         out = []
         for _ in range(_DRAWS):
@@ -206,13 +207,15 @@ class Search:
 
     def _whitening(self, fits: Sequence[Candidate], scatter: Scatter) -> Array:
         """Return the whitening of errors, enlarged if even the best fit leaves more."""
-        covariance = scatter.covariance(self.model)
-        whitening = whitening_of(covariance)
-        best = fits[0]
+        whitening = whitening_of(scatter.covariance(self.model))
+        return np.asarray(whitening / self._excess(fits[0], scatter))
+
+    def _excess(self, best: Candidate, scatter: Scatter) -> float:
+        """Return how many times as large as the scatter the errors of the best fit are, from 1."""
         error = self.model.log_spectrum(best.structure, best.vector) - self.model.log_psd
         freedom = len(error) - best.structure.size - 2
-        excess = float(np.sum((whitening @ error) ** 2)) / freedom
-        return np.asarray(whitening / np.sqrt(max(1.0, excess)))
+        whitening = whitening_of(scatter.covariance(self.model))
+        return max(1.0, float(np.sqrt(np.sum((whitening @ error) ** 2) / freedom)))
 
     def _start(self, modes: int) -> Candidate:
         """Return a random start: modes at peaks, elsewhere in the band, perhaps one beyond it."""
