@@ -47,8 +47,11 @@ from stillpath.models.plants import RelativeModesSpec
 
 __all__ = ["Explained", "Explanations", "explanations", "refit_spectrum", "same_test"]
 
+_AS_LIKELY = 4.0
+"""Excess of cost over the best fit up to which one may be the central plant: a narrow peak is
+explained as well by two modes close to each other, but not as likely."""
 _GOOD_DB, _NO_WORSE = 1.0, 1.1
-"""Fits that may be the central plant: within 1 dB, or 1.1 times the best one's residual."""
+"""Of those, it is within 1 dB, or 1.1 times the least residual."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,6 +87,8 @@ class Explanations:
     found: tuple[Candidate, ...]
     """From many starts, the best first."""
     accepted: tuple[Candidate, ...]
+    likeliest: tuple[Candidate, ...]
+    """Those of the accepted ones that may be the plant in the middle."""
     drawn: tuple[Candidate, ...]
     frame_hz: float | None
 
@@ -96,8 +101,9 @@ class Explanations:
             Share of the plants that are without what may be the frame's mode.
         """
         search, found = self.search, self.found
-        least_db = min(c.residual_db for c in self.accepted)
-        good = [c for c in self.accepted if c.residual_db <= max(_GOOD_DB, _NO_WORSE * least_db)]
+        least_db = min(c.residual_db for c in self.likeliest)
+        most_db = max(_GOOD_DB, _NO_WORSE * least_db)
+        good = [c for c in self.likeliest if c.residual_db <= most_db]
         centres = [c.structure.spec(c.theta) for c in good]
         crowd = [c.structure.spec(c.theta) for c in (*self.accepted, *self.drawn)]
         if frame_likely:
@@ -167,15 +173,19 @@ def explanations(
     search = Search(single, name, test, spectra, max_order)
     found = search.candidates(progress)
     accepted, drawn = _explanations(search, found, progress)
+    explaining = tuple(c for some in accepted for c in some)
     return Explanations(
         spectra=tuple(spectra),
         excitation=test,
         column=name,
         search=search,
         found=tuple(found),
-        accepted=tuple(accepted),
+        accepted=explaining,
+        likeliest=tuple(
+            c for some in accepted for c in some if c.cost <= some[0].cost + _AS_LIKELY
+        ),
         drawn=tuple(drawn),
-        frame_hz=frame_hz_of([c.structure.spec(c.theta) for c in (*accepted, *drawn)]),
+        frame_hz=frame_hz_of([c.structure.spec(c.theta) for c in (*explaining, *drawn)]),
     )
 
 
@@ -198,13 +208,13 @@ def same_test(spectra: Sequence[Spectrum], tests: Sequence[Excitation]) -> Excit
 
 def _explanations(
     search: Search, found: Sequence[Candidate], progress: Callable[[float], None] | None
-) -> tuple[list[Candidate], list[Candidate]]:
-    """Return the candidates that explain the spectra, and draws around them."""
-    accepted: list[Candidate] = []
+) -> tuple[list[list[Candidate]], list[Candidate]]:
+    """Return what explains the spectra by kind of scatter, the best first, and draws around it."""
+    accepted: list[list[Candidate]] = []
     drawn: list[Candidate] = []
     for k, scatter in enumerate(SCATTERS):
         some = search.accepted(found, scatter)
-        accepted += some
+        accepted.append(some)
         drawn += search.drawn(some, scatter)
         if progress:
             progress(0.5 + 0.5 * (k + 1) / len(SCATTERS))
