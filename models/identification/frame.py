@@ -15,7 +15,7 @@ import numpy as np
 
 from stillpath.models.plants import PairsSpec, PlantSpec, RelativeModesSpec, frequency_response
 
-__all__ = ["LIKELY", "frame_hz_of", "likely_of", "shaken", "without_frame"]
+__all__ = ["LIKELY", "SURELY_HZ", "frame_hz_of", "likely_of", "shaken", "without_frame"]
 
 P = TypeVar("P", bound=PlantSpec)
 
@@ -24,6 +24,9 @@ _HIGHEST_HZ, _BELOW, _SHARE = 30.0, 0.7, 0.25
 LIKELY = 0.8
 """Probability that a weak mode far below the strongest is the frame's; no measurement on the axis
 tells. Mistaking the frame's for the nozzle's costs more than the reverse (docs/tried.md)."""
+SURELY_HZ = 12.5
+"""Below, a weak mode of an axis is not the nozzle's over the bed: its spring would hardly hold an
+axis. Tables begin there, so it may be of any share, and slow motion would follow it most."""
 _UNLIKE, _UNLIKE_LIKELY = 1.5, 0.3
 """A frame stands on the same feet in X and in Y, and its frequencies there are alike: within 1.43
 times in spectra of 60 virtual printers, as a moving bed lowers that of Y. Modes further apart are
@@ -57,7 +60,7 @@ def likely_of(frames_hz: Iterable[float | None]) -> float:
     return LIKELY if not seen or max(seen) < _UNLIKE * min(seen) else _UNLIKE_LIKELY
 
 
-def without_frame(plant: P, known_hz: float | None = None) -> P:
+def without_frame(plant: P, known_hz: float | None = None, highest_hz: float = _HIGHEST_HZ) -> P:
     """Return the plant without weak modes far below its strongest one; others as they are.
 
     Parameters
@@ -65,12 +68,14 @@ def without_frame(plant: P, known_hz: float | None = None) -> P:
     known_hz : float, optional
         Frequency of a frame that was found and removed already. What it leaves there is what the
         nozzle does as the frame shakes; a mode elsewhere may be that of the table under it.
+    highest_hz : float
+        Modes above are kept.
     """
     made: PlantSpec = plant
     if isinstance(plant, RelativeModesSpec):
-        made = _modes_without(plant, known_hz)
+        made = _modes_without(plant, known_hz, highest_hz)
     elif isinstance(plant, PairsSpec):
-        made = _pairs_without(plant, known_hz)
+        made = _pairs_without(plant, known_hz, highest_hz)
     return cast(P, made)
 
 
@@ -78,9 +83,11 @@ def _of_known(f_hz: float, known_hz: float | None) -> bool:
     return known_hz is not None and _apart(f_hz, known_hz) < np.log(_UNLIKE)
 
 
-def _modes_without(plant: RelativeModesSpec, known_hz: float | None) -> RelativeModesSpec:
+def _modes_without(
+    plant: RelativeModesSpec, known_hz: float | None, highest_hz: float
+) -> RelativeModesSpec:
     strongest = max(plant.modes, key=lambda m: abs(m.share) / m.zeta)
-    most_hz = min(_HIGHEST_HZ, _BELOW * strongest.f_hz)
+    most_hz = min(highest_hz, _BELOW * strongest.f_hz)
     kept = [
         m
         for m in plant.modes
@@ -92,12 +99,12 @@ def _modes_without(plant: RelativeModesSpec, known_hz: float | None) -> Relative
     )
 
 
-def _pairs_without(plant: PairsSpec, known_hz: float | None) -> PairsSpec:
+def _pairs_without(plant: PairsSpec, known_hz: float | None, highest_hz: float) -> PairsSpec:
     poles, zeros = list(plant.poles), list(plant.zeros)
     if len(poles) < 2:
         return plant
     peaks = np.abs(frequency_response(plant, [p.f_hz for p in poles]))
-    most_hz = min(_HIGHEST_HZ, _BELOW * poles[int(np.argmax(peaks))].f_hz)
+    most_hz = min(highest_hz, _BELOW * poles[int(np.argmax(peaks))].f_hz)
     for pole in plant.poles:
         if pole.f_hz > most_hz or _of_known(pole.f_hz, known_hz):
             continue

@@ -20,6 +20,7 @@ from stillpath.models.errors import ModelError
 from stillpath.models.identification.averaging import mean_spectrum
 from stillpath.models.identification.frame import (
     LIKELY,
+    SURELY_HZ,
     frame_hz_of,
     shaken,
     without_frame,
@@ -108,6 +109,7 @@ class Explanations:
         crowd = [c.structure.spec(c.theta) for c in (*self.accepted, *self.drawn)]
         if frame_likely:
             crowd = shaken(crowd, deepcopy(search.rng), frame_likely)
+            crowd = [without_frame(plant, highest_hz=SURELY_HZ) for plant in crowd]
             centres += [without_frame(plant) for plant in centres]
         population = representatives(centres, crowd)
         chosen = good[population.middle % len(good)]
