@@ -237,3 +237,25 @@ def test_power_that_no_other_column_shows_is_no_noise_of_the_sensor() -> None:
         search = Search(replace(table, psd=columns), "x", LEGACY, [replace(table, psd=columns)], 2)
         found = np.exp(search.candidates(None)[0].vector[1])
         assert 0.2 * times * noise < found < times * noise
+
+
+def test_modes_close_to_each_other_are_found() -> None:
+    """Shares of both signs within a few hertz, as an Annex K3's X showed."""
+    modes, shares = (
+        ((88.0, 0.05), (92.0, 0.03), (95.0, 0.07), (115.0, 0.08)),
+        (-0.5, 0.92, 0.71, -0.13),
+    )
+    explaining = explanations([simulated(modes, shares, LEGACY)], LEGACY)
+    # Random starts alone leave 0.2 dB.
+    assert explaining.found[0].residual_db < 0.1
+    assert len(explaining.accepted) > 8
+
+
+def test_no_plant_keeps_a_weak_mode_at_the_edge_of_the_table() -> None:
+    """That of the frame on its feet: slow motion would follow it most of all."""
+    explaining = explanations(
+        [simulated(((10.5, 0.08), (70.0, 0.04)), (0.06, 0.94), LEGACY)], LEGACY
+    )
+    assert explaining.frame_hz == pytest.approx(10.5, rel=0.1)
+    for plant in explaining.explained().population.members:
+        assert min(mode.f_hz for mode in plant.modes) > 12.5
