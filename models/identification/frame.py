@@ -26,7 +26,7 @@ LIKELY = 0.8
 tells. Mistaking the frame's for the nozzle's costs more than the reverse (docs/tried.md)."""
 SURELY_HZ = 12.5
 """Below, a weak mode of an axis is not the nozzle's over the bed: its spring would hardly hold an
-axis. Tables begin there, so it may be of any share, and slow motion would follow it most."""
+axis. Tables begin there and hardly tell its share, on which slow motion depends most."""
 _UNLIKE, _UNLIKE_LIKELY = 1.5, 0.3
 """A frame stands on the same feet in X and in Y, and its frequencies there are alike: within 1.43
 times in spectra of 60 virtual printers, as a moving bed lowers that of Y. Modes further apart are
