@@ -33,16 +33,16 @@ def test_it_is_quicker_and_keeps_the_budget(tmp_path: Path, cache: Path, sliced:
     plain, _ = compensated(sliced, tmp_path, cache)
     assert plain.budget is None
     assert "budget_um" not in plain.settings
-    result, written = compensated(sliced, tmp_path, cache, budget_um=12)
+    result, written = compensated(sliced, tmp_path, cache, budget_um=25)
     found = result.budget
     assert found is not None
-    assert result.settings["budget_um"] == 12
+    assert result.settings["budget_um"] == 25
     assert result.put_back == []
     assert result.time_s < 0.9 * plain.time_s
     assert found.saved_share == pytest.approx(1.0 - result.time_s / result.original_time_s)
     for one in found.classes:
         # What is extruded right after a travel may have two budgets.
-        assert one.contour_rms_um <= (2 if one.name == "travel" else 1.1) * 12
+        assert one.contour_rms_um <= (2 if one.name == "travel" else 1.1) * 25
     quicker = {one.name: one.acceleration_factor for one in found.classes}
     stays = "all that stays as sliced"
     assert set(quicker) == {"External perimeter", "Internal infill", "travel", stays}
@@ -57,8 +57,8 @@ def test_it_is_quicker_and_keeps_the_budget(tmp_path: Path, cache: Path, sliced:
             for one in (plain, result)
         ]
         assert figures[1] == pytest.approx(figures[0], rel=0.05, abs=0.2)
-    assert "budget 12 µm" in budget_line(found)
-    again, same = compensated(sliced, tmp_path, cache, budget_um=12)
+    assert "budget 25 µm" in budget_line(found)
+    again, same = compensated(sliced, tmp_path, cache, budget_um=25)
     assert same == written
     assert again.budget == found
 
