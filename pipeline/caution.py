@@ -63,7 +63,7 @@ Pair: TypeAlias = tuple[DiscretePlant, DiscretePlant]
 Shares: TypeAlias = tuple[float, float]
 """Share of a command in its mixture with the shaper's, for X and Y."""
 
-_VERSION = 14
+_VERSION = 15
 _SHARES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.2, 0.0)
 _UNSEEN_SHARE = 0.85
 """Largest share where the phase was not measured: a set cannot warn of what it does not contain."""
@@ -147,9 +147,14 @@ def measured_set(axis: PlantSetSpec) -> bool:
     return members and stated_hz(axis) is None
 
 
-def design_mode(machine: Machine) -> str:
-    """Return the robust mode of `compensation.fbf.PreviewFbf` that `robust=auto` tries first."""
-    return "ensemble" if any(map(measured_set, machine.axes.values())) else "off"
+def design_mode(machine: Machine, *, budget: bool = False) -> str:
+    """Return the robust mode of `compensation.fbf.PreviewFbf` that `robust=auto` tries first.
+
+    A speed budget limits the error of the worst plant, so with one that plant counts more.
+    """
+    if not any(map(measured_set, machine.axes.values())):
+        return "off"
+    return "minimax" if budget else "ensemble"
 
 
 def set_or_nominal(mode: str, design: Callable[[str], T]) -> T:
@@ -176,7 +181,8 @@ def caution_for(
     stated = not machine.schedules and any(map(stated_hz, machine.axes.values()))
     if not measured and not stated:
         return None
-    return choose_caution(machine, shaper, directory, dt_s, options.basis)
+    mode = design_mode(machine, budget=options.budget_um is not None)
+    return choose_caution(machine, shaper, directory, dt_s, options.basis, mode)
 
 
 def stated_note(machine: Machine, shaper: BestShaper) -> str | None:
@@ -226,7 +232,12 @@ def _friction_unseen(machine: Machine) -> str:
 
 
 def choose_caution(
-    machine: Machine, shaper: BestShaper, directory: Path, dt_s: float, basis: str = DEFAULT_BASIS
+    machine: Machine,
+    shaper: BestShaper,
+    directory: Path,
+    dt_s: float,
+    basis: str = DEFAULT_BASIS,
+    mode: str = "ensemble",
 ) -> tuple[Caution, Choice]:
     """Choose the mixture of compensation and shaper for a machine, once per machine revision.
 
@@ -240,9 +251,11 @@ def choose_caution(
         Sampling time of the commands.
     basis : str
         A key of `compensation.basis.BASES`.
+    mode : str
+        Robust mode of `compensation.fbf.PreviewFbf`.
     """
-    path = directory / f"caution-{machine.revision}-{basis}-v{_VERSION}.json"
-    choice = kept(path, _read, lambda: _tried(machine, shaper, dt_s, basis))
+    path = directory / f"caution-{machine.revision}-{basis}-{mode}-v{_VERSION}.json"
+    choice = kept(path, _read, lambda: _tried(machine, shaper, dt_s, basis, mode))
     return (
         Caution(choice.shares, shaper.type, shaper.fx_hz, shaper.fy_hz, choice.fit_share),
         choice,
@@ -318,10 +331,10 @@ def best_shares(cost: Callable[[Shares], float], most: Sequence[float]) -> Share
     return best
 
 
-def _tried(machine: Machine, shaper: BestShaper, dt_s: float, basis: str) -> Choice:
+def _tried(machine: Machine, shaper: BestShaper, dt_s: float, basis: str, mode: str) -> Choice:
     path, extruding = reference_motion_of(machine, dt_s)
     most_shares = [most_share(machine.axes[axis]) for axis in ("x", "y")]
-    exact, smooth = _commands(machine, shaper, basis, dt_s, fbf=any(most_shares))
+    exact, smooth = _commands(machine, shaper, basis, dt_s, mode if any(most_shares) else None)
     mixtures = Mixtures(machine, path, extruding, smooth, dt_s)
     exact_mm = mixtures.answers(exact)
     none_mm = np.maximum(mixtures.errors_mm(mixtures.answers(path)), 1e-12)
@@ -353,20 +366,20 @@ def _tried(machine: Machine, shaper: BestShaper, dt_s: float, basis: str) -> Cho
 
 
 def _commands(
-    machine: Machine, shaper: BestShaper, basis: str, dt_s: float, *, fbf: bool
+    machine: Machine, shaper: BestShaper, basis: str, dt_s: float, mode: str | None
 ) -> tuple[Array, Array]:
     """Return the commands of filtered basis functions and of the shaper on the reference motion.
 
-    Without `fbf`, both are the shaper's.
+    Without a robust mode, both are the shaper's.
     """
     path, extruding = reference_motion_of(machine, dt_s)
     smooth = ShaperCompensator(
         machine, dt_s, shaper=shaper.type, fx_hz=shaper.fx_hz, fy_hz=shaper.fy_hz
     ).compensate(path, extruding, _NO_RESTS)
-    if not fbf:
+    if mode is None:
         return smooth, smooth
     exact = set_or_nominal(
-        "ensemble", lambda mode: PreviewFbf(_strong(machine), dt_s, basis=basis, robust=mode)
+        mode, lambda tried: PreviewFbf(_strong(machine), dt_s, basis=basis, robust=tried)
     )
     exact.reset(path[:, 0])
     return exact.compensate(path, extruding, _NO_RESTS), smooth

@@ -363,7 +363,8 @@ def _designed(
             return compensator(options.method, machine, DT_S, **settings, caution=caution)
 
         if options.robust == "auto":
-            return set_or_nominal(design_mode(machine), design)
+            mode = design_mode(machine, budget=options.budget_um is not None)
+            return set_or_nominal(mode, design)
         return design(options.robust)
     if shaper is not None and options.vibration == f"shaper:{shaper.type}":
         hz = {"fx_hz": shaper.fx_hz, "fy_hz": shaper.fy_hz}

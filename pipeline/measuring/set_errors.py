@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import reduce
+from operator import add
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stillpath.gcode.pacing import TRAVEL
+from stillpath.gcode.pacing import AS_SLICED, TRAVEL
 from stillpath.models.arrays import Array, Mask
 from stillpath.models.machine import Machine
 from stillpath.models.plants import plant_set
@@ -15,12 +18,14 @@ from stillpath.models.schedule import EMPTY, OperatingPoint
 from stillpath.simulation.measures import ContourErrors, ContourMeter, GroupTally
 from stillpath.simulation.scheduled import MachineStream
 
-__all__ = ["LANDING_S", "ClassError", "ErrorSum", "SetErrors", "machine_numbers"]
+__all__ = ["LANDING_S", "WHOLE", "ClassError", "ErrorSum", "SetErrors", "machine_numbers", "whole"]
 
 Ints = NDArray[np.int32]
 
 LANDING_S = 0.05
 """Extrusion this soon after a travel also counts for the travel, which excited the machine."""
+WHOLE = -4
+"""Number, beside those of classes, of all that they extrude."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +62,12 @@ class ErrorSum:
             return ClassError(0.0, 0.0)
         mean = max(float(np.max(self.squares_um2_s)), 0.0) / self.seconds
         return ClassError(float(np.sqrt(mean)), self.seconds)
+
+
+def whole(sums: Mapping[int, ErrorSum]) -> ErrorSum | None:
+    """Return the sum over all classes that have a pace; None if they extrude nothing."""
+    parts = [found for one, found in sums.items() if one not in (TRAVEL, AS_SLICED)]
+    return reduce(add, parts) if parts else None
 
 
 def machine_numbers(machine: Machine, dt_s: float) -> list[int | None]:

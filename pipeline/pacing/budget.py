@@ -30,7 +30,7 @@ from stillpath.gcode.slicers.features import feature_name, feature_title
 from stillpath.gcode.types import Moves
 from stillpath.models.machine import CommandLimits, Machine
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
-from stillpath.pipeline.measuring.set_errors import ErrorSum
+from stillpath.pipeline.measuring.set_errors import WHOLE, ErrorSum, whole
 from stillpath.pipeline.options import LEAST_BUDGET_UM, Options
 from stillpath.pipeline.pacing.pace_search import PaceChoice, allowed_um, search
 from stillpath.pipeline.pacing.pace_trials import Factors, PaceTrials, compensated, paces, shaped
@@ -167,6 +167,10 @@ class SpeedBudget:
                 self._used_logs[one] = self._used_logs.get(one, 0.0) + new_s * math.log(factor)
                 self._counted_s[one] = seconds
         used = {one: self._used(one, sums[one]) for one in self.factors if one in sums}
+        everything = whole(sums)
+        if everything is not None:
+            used[WHOLE] = self._used(WHOLE, everything)
+            self._hold_whole(everything)
         has_room = max(used.values(), default=0.0) < _FULL
         for one, factor in sorted(self.factors.items()):
             if one not in used:
@@ -186,6 +190,14 @@ class SpeedBudget:
                 target = max(factor, min(_FASTER * factor, highest))
             if target != factor:
                 self.factors[one], self._since[one] = target, sums[one]
+
+    def _hold_whole(self, found: ErrorSum) -> None:
+        """Slow down if all that is extruded uses up the budget, now and since the last time."""
+        new = found - self._since[WHOLE] if WHOLE in self._since else found
+        recent = self._used(WHOLE, new)
+        if new.seconds >= _SURE_S and min(self._used(WHOLE, found), recent) > _HELPLESS:
+            self._slow_others()
+            self._since[WHOLE] = found
 
     def _slow_others(self) -> None:
         """Slow down what disturbs a class at its own pace: travel first, then all others."""

@@ -65,19 +65,14 @@ def test_it_is_quicker_and_keeps_the_budget(tmp_path: Path, cache: Path, sliced:
 
 @pytest.mark.slow
 def test_a_small_budget_changes_no_speed(tmp_path: Path, cache: Path, sliced: bytes) -> None:
-    _, plain = compensated(sliced, tmp_path, cache)
-    result, written = compensated(sliced, tmp_path, cache, budget_um=0.5)
+    plain, _ = compensated(sliced, tmp_path, cache)
+    result, _ = compensated(sliced, tmp_path, cache, budget_um=0.5)
     assert result.budget is not None
     raised = [one for one in result.budget.classes if one.acceleration_factor > 1.0]
     over = [one for one in result.budget.classes if one.contour_rms_um > 0.5]
     assert len([w for w in result.warnings if "above the budget" in w]) == len(over)
-    if not raised:
-        # The stamp tells the settings, and nothing else differs.
-        strip = [
-            [line for line in text.splitlines() if b"Processed by" not in line]
-            for text in (plain, written)
-        ]
-        assert strip[0] == strip[1]
+    assert not raised
+    assert result.time_s == pytest.approx(plain.time_s, rel=2e-3)
 
 
 def test_shapers_have_budgets_too(tmp_path: Path, cache: Path, sliced: bytes) -> None:

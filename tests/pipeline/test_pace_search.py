@@ -152,6 +152,20 @@ def test_a_file_above_its_budget_is_written_anew() -> None:
     assert budget(wall=1.0, travel=1.0).gentler(over) is None
 
 
+def test_all_slow_down_where_the_print_as_a_whole_uses_up_its_budget() -> None:
+    """Infill was above the budget as sliced, and may become a tenth worse; the print may not."""
+    chosen = {WALL: 4.0, INFILL: 1.0, TRAVEL: 2.0}
+    bounds = {WALL: 10.0, INFILL: 13.0, TRAVEL: 20.0}
+    choice = PaceChoice(chosen, bounds)
+    tops = dict.fromkeys(chosen, 6.0)
+    paces = SpeedBudget(load_machine("ender3"), 10.0, FirstLayer(), choice, choice, tops)
+    travel = sums(18.5, 10.0)
+    paces.correct({WALL: sums(9.2, 90.0), INFILL: sums(12.9, 5.0), TRAVEL: travel})
+    assert paces.factors == chosen
+    paces.correct({WALL: sums(9.2, 90.0), INFILL: sums(12.9, 60.0), TRAVEL: travel})
+    assert paces.factors[TRAVEL] < 2.0
+
+
 @pytest.mark.parametrize(
     ("budget_um", "remedy"), [(10.0, "give a smaller budget"), (0.5, "without a budget it keeps")]
 )
