@@ -118,8 +118,9 @@ class Explanations:
             n: min(c.residual_db for c in found if c.structure.modes == n) for n in search.orders
         }
         cross = cross_axis_share(mean_spectrum(self.spectra), self.column, search.model.band_hz)
+        names = ", ".join(one.source for one in self.spectra)
         notes = (
-            *spectrum_level_warning(gain, self.excitation),
+            *spectrum_level_warning(gain, self.excitation, names),
             *cross_axis_warning(*cross, self.column),
             *apart_warning(self.spectra, search.repeats),
             *frame_mode_notes(

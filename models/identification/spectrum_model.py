@@ -16,7 +16,13 @@ from stillpath.models.identification.excitation import (
 from stillpath.models.identification.modal_structure import ModalStructure
 from stillpath.models.identification.types import Excitation, Spectrum
 
-__all__ = ["SpectrumModel", "cross_axis_share", "driven_column", "spectrum_model"]
+__all__ = [
+    "SpectrumModel",
+    "cross_axis_share",
+    "driven_column",
+    "moved_most",
+    "spectrum_model",
+]
 
 _LOWEST_HZ = 8.0
 _BELOW_END_HZ = 3.0
@@ -131,6 +137,21 @@ def driven_column(spectrum: Spectrum) -> str:
     names = [name for name in spectrum.psd if name != "xyz"] or list(spectrum.psd)
     low = (spectrum.f_hz >= _PLATEAU_HZ[0]) & (spectrum.f_hz <= _PLATEAU_HZ[1])
     return max(names, key=lambda name: float(np.nansum(spectrum.psd[name][low])))
+
+
+def moved_most(spectrum: Spectrum) -> tuple[str, float]:
+    """Return the sensor's axis that followed the drive, and its share of the power there.
+
+    Returns
+    -------
+    (str, float)
+        ("", 0.0) where the table does not part the sensor's axes.
+    """
+    low = (spectrum.f_hz >= _PLATEAU_HZ[0]) & (spectrum.f_hz <= _PLATEAU_HZ[1])
+    power = {n: float(np.nansum(spectrum.psd[n][low])) for n in "xyz" if n in spectrum.psd}
+    total = sum(power.values())
+    most = max(power, key=power.__getitem__, default="")
+    return (most, power[most] / total) if total > 0.0 else ("", 0.0)
 
 
 def cross_axis_share(
