@@ -309,8 +309,9 @@ def spectrum_level_warning(gain: float, excitation: Excitation, names: str) -> t
             f"{names}: at low frequency the sensor moved {gain:.2g} times as much as a test with "
             f"accel_per_hz {stated:g} commands, {_TABLE_LEVELS[0]:g} to {_TABLE_LEVELS[1]:g} is to "
             "be expected: it was not mounted on what this axis moves (the head; the bed of a bed "
-            f"slinger), or the table holds only noise. If accel_per_hz was {gain * stated:.3g}, "
-            "say so; else measure again"
+            "slinger), the table holds only noise, or the test began at a higher min_freq than "
+            f"{excitation.f_start_hz:g} Hz. If that, or accel_per_hz {gain * stated:.3g}, was so, "
+            "say it; else measure again"
         )
     if abs(gain - 1) <= 2 * _LEVEL_TOLERANCE:
         return ()

@@ -132,13 +132,16 @@ def spectrum_model(spectrum: Spectrum, column: str, excitation: Excitation) -> S
     return SpectrumModel(f[use], np.log(psd[use]), kernel, fine)
 
 
-def driven_column(spectrum: Spectrum) -> str:
+def driven_column(spectrum: Spectrum, f_start_hz: float = 0.0) -> str:
     """Return the column that follows the drive: the largest from 8 to 15 Hz.
 
-    Not always the tested axis: sensors are mounted turned.
+    Not always the tested axis: sensors are mounted turned. Of a test that begins higher
+    (`f_start_hz`), the largest in its first 7 Hz: below there is only noise.
     """
     names = [name for name in spectrum.psd if name != "xyz"] or list(spectrum.psd)
-    low = (spectrum.f_hz >= _PLATEAU_HZ[0]) & (spectrum.f_hz <= _PLATEAU_HZ[1])
+    low_hz = max(_PLATEAU_HZ[0], f_start_hz)
+    high_hz = max(_PLATEAU_HZ[1], low_hz + _PLATEAU_HZ[1] - _PLATEAU_HZ[0])
+    low = (spectrum.f_hz >= low_hz) & (spectrum.f_hz <= high_hz)
     return max(names, key=lambda name: float(np.nansum(spectrum.psd[name][low])))
 
 

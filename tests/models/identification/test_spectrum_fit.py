@@ -210,6 +210,17 @@ def test_column_that_follows_the_drive() -> None:
         explain_spectra([turned], LEGACY, column="q")
 
 
+def test_column_of_a_test_that_begins_above_15_hz() -> None:
+    """Below its start the axis of the sensor that hisses most was taken to follow it."""
+    test = replace(LEGACY, f_start_hz=20.0)
+    spectrum = simulated(NARROW, (0.7, 0.3), test)
+    z = np.where(spectrum.f_hz < 18.0, 2.0 * spectrum.psd["x"], spectrum.psd["y"])
+    hissing = replace(spectrum, psd={**spectrum.psd, "z": z})
+    assert driven_column(hissing) == "z"
+    assert driven_column(hissing, test.f_start_hz) == "x"
+    assert explanations([hissing], test, max_order=1).column == "x"
+
+
 @pytest.mark.slow
 def test_coupled_axes_are_told() -> None:
     spectrum = simulated(NARROW, (0.7, 0.3), LEGACY)
