@@ -149,8 +149,9 @@ def _response(measured: FrequencyResponse, fit: Fit) -> ResponseFigures:
 
 
 def _spectrum(measured: Spectrum, fit: Fit, settings: ReadSettings) -> SpectrumFigures:
-    column = settings.sensor_axis or driven_column(measured)
-    f, seen, predicted = predicted_psd(measured, column, excitation_for(measured, settings), fit)
+    test = excitation_for(measured, settings)
+    column = settings.sensor_axis or driven_column(measured, test.f_start_hz)
+    f, seen, predicted = predicted_psd(measured, column, test, fit)
     return SpectrumFigures(
         label=f"{measured.source} ({column})",
         f_hz=_plain(f),

@@ -46,6 +46,7 @@ from stillpath.models.identification.messages import (
     phase_fault,
     phase_warning,
     scale_warnings,
+    table_mounting_notes,
     unvaried_notes,
 )
 from stillpath.models.identification.modal_fit import refit
@@ -158,7 +159,7 @@ def identify(
         note = no_frame_note(frames_hz)
         found = {axis: replace(one, notes=(*one.notes, note)) for axis, one in found.items()}
     if not settings.sensor_turned:
-        check_directions(found.values())
+        check_directions(found.values(), stated=settings.sensor_axis is not None)
     check_axes(list(found.values()))
     found = timed(found, {axis: work.late for axis, work in works.items()})
     steps.say("done", 1.0)
@@ -334,6 +335,8 @@ class _AxisWork:
         notes = [
             (s.source, note) for s, _, _ in spectra for note in excitation_notes(s, self._settings)
         ]
+        if not self._settings.sensor_axis:
+            notes += table_mounting_notes(self._axis, [s for s, _, _ in spectra])
         common = usual([c for _, _, c in spectra], self._axis)
         found = spectrum_set(
             self._explanations, axis=self._axis, frame_likely=frame_likely, origin=self._origin

@@ -13,6 +13,7 @@ from stillpath.models.friction import LEAST_MM_S2
 from stillpath.models.identification.estimation import plateau_gain
 from stillpath.models.identification.nozzle import Frame
 from stillpath.models.identification.readers.checks import RANGE_ENDED
+from stillpath.models.identification.spectrum_model import moved_most
 from stillpath.models.identification.trust import main_mode, main_mode_known
 from stillpath.models.identification.types import (
     AxisIdentification,
@@ -39,6 +40,7 @@ __all__ = [
     "phase_warning",
     "scale_warnings",
     "spectrum_level_warning",
+    "table_mounting_notes",
     "unvaried_notes",
 ]
 
@@ -49,6 +51,8 @@ _APART_DB = 2.0
 _DB = 10 / np.log(10)
 _LEVEL_TOLERANCE = 0.15
 _LEVELS = (0.3, 3.0)
+_TABLE_LEVELS = (0.2, 5.0)
+"""Of tables, which do not say their accel_per_hz: 12 to 300 where it is not stated."""
 _POOR, _POOR_DB = 0.15, 1.1
 _USELESS, _USELESS_DB = 0.5, 6.0
 """Residuals beyond which a fit is no model of what was measured."""
@@ -72,13 +76,26 @@ def mounting_notes(axis: str, responses: Sequence[FrequencyResponse]) -> list[st
         along = dict(zip("xyz", map(abs, response.sensor_direction or ()), strict=False))
         most = max(along, key=along.__getitem__, default=axis)
         if most != axis and along[most] > _MOSTLY:
-            text = (
-                f"the sensor's {most} moved in the test of axis {axis}, so it was taken "
-                "to be mounted so; if it is not, another axis was measured (sensor_axis "
-                f"{axis} refuses such a log)"
-            )
-            notes.append((response.source, text))
+            notes.append((response.source, _turned_text(most, axis, "log")))
     return by_file(notes)
+
+
+def table_mounting_notes(axis: str, spectra: Sequence[Spectrum]) -> list[tuple[str, str]]:
+    """Return files and notes where a table shows the test in another of the sensor's axes."""
+    moved = [(one.source, *moved_most(one)) for one in spectra]
+    return [
+        (source, _turned_text(most, axis, "table"))
+        for source, most, share in moved
+        if most != axis and share > _MOSTLY
+    ]
+
+
+def _turned_text(most: str, axis: str, kind: str) -> str:
+    return (
+        f"the sensor's {most} moved in the test of axis {axis}, so it was taken "
+        "to be mounted so; if it is not, another axis was measured (sensor_axis "
+        f"{axis} refuses such a {kind})"
+    )
 
 
 def body_notes(friction_mm: float, frame: Frame | None) -> list[str]:
@@ -278,9 +295,24 @@ def _slope_text(response: FrequencyResponse) -> str:
     )
 
 
-def spectrum_level_warning(gain: float, excitation: Excitation) -> tuple[str, ...]:
-    """Warn of a level that another accel_per_hz would explain better."""
+def spectrum_level_warning(gain: float, excitation: Excitation, names: str) -> tuple[str, ...]:
+    """Warn of a level that another accel_per_hz would explain better; refuse one that none does.
+
+    Raises
+    ------
+    ModelError
+        If the sensor hardly moved with the test, or far too much.
+    """
     stated = excitation.accel_per_hz_mm_s
+    if not _TABLE_LEVELS[0] < gain < _TABLE_LEVELS[1]:
+        raise ModelError(
+            f"{names}: at low frequency the sensor moved {gain:.2g} times as much as a test with "
+            f"accel_per_hz {stated:g} commands, {_TABLE_LEVELS[0]:g} to {_TABLE_LEVELS[1]:g} is to "
+            "be expected: it was not mounted on what this axis moves (the head; the bed of a bed "
+            "slinger), the table holds only noise, or the test began at a higher min_freq than "
+            f"{excitation.f_start_hz:g} Hz. If that, or accel_per_hz {gain * stated:.3g}, was so, "
+            "say it; else measure again"
+        )
     if abs(gain - 1) <= 2 * _LEVEL_TOLERANCE:
         return ()
     rubs = "; an axis that rubs much moves less, too" if gain < 1.0 else ""

@@ -118,8 +118,9 @@ class Explanations:
             n: min(c.residual_db for c in found if c.structure.modes == n) for n in search.orders
         }
         cross = cross_axis_share(mean_spectrum(self.spectra), self.column, search.model.band_hz)
+        names = ", ".join(one.source for one in self.spectra)
         notes = (
-            *spectrum_level_warning(gain, self.excitation),
+            *spectrum_level_warning(gain, self.excitation, names),
             *cross_axis_warning(*cross, self.column),
             *apart_warning(self.spectra, search.repeats),
             *frame_mode_notes(
@@ -171,7 +172,7 @@ def explanations(
     tests = [excitation] if isinstance(excitation, Excitation) else excitation
     test = same_test(spectra, tests)
     single = mean_spectrum(spectra)
-    name = _column(single, column)
+    name = _column(single, test, column)
     search = Search(single, name, test, spectra, max_order)
     found = search.candidates(progress)
     accepted, drawn = _explanations(search, found, progress)
@@ -233,7 +234,7 @@ def refit_spectrum(
     ModelError
         As `explanations`.
     """
-    name = _column(spectrum, column)
+    name = _column(spectrum, excitation, column)
     search = Search(spectrum, name, excitation, [spectrum], len(like.modes))
     whitening = whitening_of(SCATTERS[0].covariance(search.model))
     fitted = search.polished(search.like(like.spec), whitening, search.model.log_psd, 40)
@@ -249,9 +250,9 @@ def refit_spectrum(
     )
 
 
-def _column(spectrum: Spectrum, column: str | None) -> str:
+def _column(spectrum: Spectrum, excitation: Excitation, column: str | None) -> str:
     if column is None:
-        return driven_column(spectrum)
+        return driven_column(spectrum, excitation.f_start_hz)
     if column not in spectrum.psd:
         raise ModelError(
             f"{spectrum.source or 'spectrum'}: no column {column!r}; there are "

@@ -16,7 +16,13 @@ from stillpath.models.identification.excitation import (
 from stillpath.models.identification.modal_structure import ModalStructure
 from stillpath.models.identification.types import Excitation, Spectrum
 
-__all__ = ["SpectrumModel", "cross_axis_share", "driven_column", "spectrum_model"]
+__all__ = [
+    "SpectrumModel",
+    "cross_axis_share",
+    "driven_column",
+    "moved_most",
+    "spectrum_model",
+]
 
 _LOWEST_HZ = 8.0
 _BELOW_END_HZ = 3.0
@@ -99,6 +105,9 @@ def spectrum_model(spectrum: Spectrum, column: str, excitation: Excitation) -> S
     psd = spectrum.psd[column]
     use = (f >= _LOWEST_HZ) & (f <= excitation.f_end_hz - _BELOW_END_HZ)
     use &= f >= excitation.f_start_hz + bin_hz
+    # Klipper interpolates tables of several data sets every 0.2 Hz: no more is known than by bin.
+    apart = max(1, round(bin_hz / float(np.median(np.diff(f)))))
+    use &= np.arange(len(f)) % apart == 0
     source = spectrum.source or "spectrum"
     if use.sum() < _LEAST_BINS:
         raise ModelError(
@@ -123,14 +132,32 @@ def spectrum_model(spectrum: Spectrum, column: str, excitation: Excitation) -> S
     return SpectrumModel(f[use], np.log(psd[use]), kernel, fine)
 
 
-def driven_column(spectrum: Spectrum) -> str:
+def driven_column(spectrum: Spectrum, f_start_hz: float = 0.0) -> str:
     """Return the column that follows the drive: the largest from 8 to 15 Hz.
 
-    Not always the tested axis: sensors are mounted turned.
+    Not always the tested axis: sensors are mounted turned. Of a test that begins higher
+    (`f_start_hz`), the largest in its first 7 Hz: below there is only noise.
     """
     names = [name for name in spectrum.psd if name != "xyz"] or list(spectrum.psd)
-    low = (spectrum.f_hz >= _PLATEAU_HZ[0]) & (spectrum.f_hz <= _PLATEAU_HZ[1])
+    low_hz = max(_PLATEAU_HZ[0], f_start_hz)
+    high_hz = max(_PLATEAU_HZ[1], low_hz + _PLATEAU_HZ[1] - _PLATEAU_HZ[0])
+    low = (spectrum.f_hz >= low_hz) & (spectrum.f_hz <= high_hz)
     return max(names, key=lambda name: float(np.nansum(spectrum.psd[name][low])))
+
+
+def moved_most(spectrum: Spectrum) -> tuple[str, float]:
+    """Return the sensor's axis that followed the drive, and its share of the power there.
+
+    Returns
+    -------
+    (str, float)
+        ("", 0.0) where the table does not part the sensor's axes.
+    """
+    low = (spectrum.f_hz >= _PLATEAU_HZ[0]) & (spectrum.f_hz <= _PLATEAU_HZ[1])
+    power = {n: float(np.nansum(spectrum.psd[n][low])) for n in "xyz" if n in spectrum.psd}
+    total = sum(power.values())
+    most = max(power, key=power.__getitem__, default="")
+    return (most, power[most] / total) if total > 0.0 else ("", 0.0)
 
 
 def cross_axis_share(

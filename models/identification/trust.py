@@ -9,6 +9,7 @@ import numpy as np
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.alignment import check_pair
 from stillpath.models.identification.response_data import LEAST_COHERENCE, coherent
+from stillpath.models.identification.spectrum_model import moved_most
 from stillpath.models.identification.types import (
     AxisIdentification,
     Fit,
@@ -36,6 +37,9 @@ _UNSEEN_ZETA = 0.03
 _MOST_UNSURE = 0.05
 """Relative standard deviation of the frequency of the mode that rings most."""
 _MOST_LEVEL = 2.0
+_ONE_DIRECTION = 0.8
+"""Share of power from which an axis of the sensor lies within 27 degrees of the motion: two
+perpendicular motions cannot both."""
 _MOST_APART_S = 2e-3
 """Largest plausible difference between the delays of two axes: beyond it, a wrong clock or noise
 is the cause rather than a drive, belt or sensor."""
@@ -146,12 +150,18 @@ def check_axes(found: Sequence[AxisIdentification]) -> None:
         )
 
 
-def check_directions(found: Iterable[AxisIdentification]) -> None:
-    """Refuse logs of X and Y that moved the sensor along the same of its directions."""
+def check_directions(found: Iterable[AxisIdentification], *, stated: bool = False) -> None:
+    """Refuse logs, or tables, of X and Y that moved the sensor along the same of its directions.
+
+    Parameters
+    ----------
+    stated : bool
+        Along which axis of the sensor tables were measured was said.
+    """
+    first = [one.measured[0] for one in found if one.measured]
     along = [
         (r.source, r.sensor_direction)
-        for one in found
-        for r in one.measured[:1]
+        for r in first
         if isinstance(r, FrequencyResponse) and r.sensor_direction is not None
     ]
     if len(along) == 2:
@@ -160,6 +170,17 @@ def check_directions(found: Iterable[AxisIdentification]) -> None:
             check_pair(x_direction, y_direction)
         except ModelError as error:
             raise ModelError(f"{x}, {y}: {error}") from None
+    moved = [(r.source, *moved_most(r)) for r in first if isinstance(r, Spectrum)]
+    if len(moved) == 2 and not stated:
+        (x, in_x, x_share), (y, in_y, y_share) = moved
+        if in_x == in_y and min(x_share, y_share) >= _ONE_DIRECTION:
+            raise ModelError(
+                f"{x}, {y}: the tests of X and Y both moved the sensor along its {in_x} "
+                f"({x_share:.0%} and {y_share:.0%} of the power from 8 to 15 Hz, where tests of "
+                f"two axes share less than {_ONE_DIRECTION:.0%}): the same axis was measured "
+                "twice, so measure the other one; if the sensor was mounted differently for X and "
+                "for Y, say so (option sensor_turned)"
+            )
 
 
 def keeps_time(found: AxisIdentification) -> bool:

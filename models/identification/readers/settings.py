@@ -26,6 +26,8 @@ Column = str | Annotated[int, Field(ge=0)]
 """By name, or counted from 0."""
 
 _NEW_TEST = date(2024, 12, 1)
+_TELLS_RANGE = date(2024, 2, 17)
+"""Since then a table ends at 1.5 max_freq (klippy/extras/resonance_tester.py), before at 200 Hz."""
 _KLIPPER = {
     "accel_per_hz_mm_s": "accel_per_hz",
     "f_start_hz": "min_freq",
@@ -44,6 +46,11 @@ _BESIDE_SLOW_HZ, _SLOW_RATE_HZ, _LEAST_SLOW_S = 0.05, 20.0, 30.0
 _SLOW_MM_S2, _MOVED_MM_S2 = (60.0, 180.0), 500.0
 """Slow motion without and with the slow sweep, rms: its 400 mm/s^2 are 360 in the first harmonic.
 Below the last value in all, the sensor did not move with the test and tells nothing."""
+_SLOW_BAND_HZ, _ABOVE_HZ, _SLOW_IN_TABLE_MM_S2 = (1.0, 4.0), (8.0, 15.0), (110.0, 150.0)
+_LEAST_SLOW = 0.5
+"""The same in a table, where the window leaves 228 mm/s^2 of the slow sweep, 1.5 times the power of
+the test itself from 8 to 15 Hz. Without it up to 92 mm/s^2 and 0.21 times (45 real tables); more of
+a test with a large accel_per_hz."""
 _DIAGONAL = re.compile(r"-?\d+(\.\d+)?,-?\d+(\.\d+)?(,-?\d+(\.\d+)?)?")
 _DAY = re.compile(r"\d{4}-\d\d-\d\d")
 _DATE = re.compile(r"(?<!\d)(20\d\d)[-_]?(\d\d)[-_]?(\d\d)(?!\d)")
@@ -159,8 +166,8 @@ def excitation_for(
 
     Defaults of klippy/extras/resonance_tester.py: before 2024-12 from 5 to 133.33 Hz with
     75 mm/s and without the slow square wave; since then from 5 to 135 Hz with 60 mm/s,
-    400 mm/s^2 and 1.2 s. Always 1 Hz/s. A raw log tells which by its slow motion, whatever its
-    date: many printers have an older Klipper than the day.
+    400 mm/s^2 and 1.2 s. Always 1 Hz/s. A file tells which by its slow motion, whatever its
+    date: many printers have an older Klipper than the day, and Kalico has no slow square wave.
 
     Raises
     ------
@@ -201,8 +208,8 @@ def _resolved(measurement: AccelerationLog | Spectrum, settings: ReadSettings) -
         )
     made = settings.firmware_date or date_in_name(measurement.source)
     defaults = Excitation(direction=direction_of(axis))
-    by_log = _contradicts(measurement, settings, made)
-    old = _is_old(made) is not by_log
+    by_file = _contradicts(measurement, settings, made)
+    old = _is_old(made) is not by_file
     given = {
         "accel_per_hz_mm_s": settings.accel_per_hz_mm_s,
         "f_start_hz": settings.f_start_hz,
@@ -214,7 +221,8 @@ def _resolved(measurement: AccelerationLog | Spectrum, settings: ReadSettings) -
     if isinstance(measurement, Spectrum) and measurement.accel_per_hz_mm_s is not None:
         given["accel_per_hz_mm_s"] = measurement.accel_per_hz_mm_s
     found: list[str] = []
-    if isinstance(measurement, Spectrum) and not old and settings.f_end_hz is None:
+    tells_range = made is None or made >= _TELLS_RANGE
+    if isinstance(measurement, Spectrum) and tells_range and settings.f_end_hz is None:
         given["f_end_hz"] = _end_of_range(measurement, defaults.f_end_hz)
         if given["f_end_hz"] is not None:
             found.append(
@@ -238,7 +246,7 @@ def _resolved(measurement: AccelerationLog | Spectrum, settings: ReadSettings) -
         )
     excitation = Excitation(direction=defaults.direction, **values)
     if assumed:
-        era = _era(made, settings, by_log=by_log)
+        era = _era(made, settings, shows=_kind(measurement) if by_file else "")
         found.append(f"assumed {', '.join(assumed)}: the defaults of Klipper {era}")
     return _Resolved(excitation, tuple(found))
 
@@ -246,8 +254,7 @@ def _resolved(measurement: AccelerationLog | Spectrum, settings: ReadSettings) -
 def _end_of_range(spectrum: Spectrum, default_hz: float) -> float | None:
     """Return max_freq if the table tells that it is not the default, nor that of before.
 
-    Since 2024-12 tables end at the last bin up to 1.5 max_freq (klippy/extras/
-    resonance_tester.py), before then at 200 Hz.
+    Since 2024-02 tables end at the last bin up to 1.5 max_freq.
     """
     bin_hz = float(spectrum.f_hz[-1] - spectrum.f_hz[-2])
     least = float(spectrum.f_hz[-1]) / 1.5
@@ -276,11 +283,34 @@ def _is_old(made: date | None) -> bool:
 def _contradicts(
     measurement: AccelerationLog | Spectrum, settings: ReadSettings, made: date | None
 ) -> bool:
-    """Return whether a raw log shows another test than that of its day."""
-    if settings.sweeping_accel_mm_s2 is not None or not isinstance(measurement, AccelerationLog):
+    """Return whether a file shows another test than that of its day."""
+    if settings.sweeping_accel_mm_s2 is not None:
         return False
+    if isinstance(measurement, Spectrum):
+        return _table_sweeps(measurement) is _is_old(made)
     period_s = settings.sweeping_period_s or Excitation((1.0, 0.0)).sweeping_period_s
     return _sweeps(measurement, period_s) is _is_old(made)
+
+
+def _table_sweeps(table: Spectrum) -> bool | None:
+    """Return whether a table shows the slow square wave of tests since 2024-12; None if unsure."""
+    axes = [psd for name, psd in table.psd.items() if name in ("x", "y", "z")]
+    densities = np.array([np.sum(axes, axis=0)] if axes else [*table.psd.values()])
+    powers = densities * np.gradient(table.f_hz)
+
+    def largest(band_hz: tuple[float, float]) -> float:
+        within = (table.f_hz >= band_hz[0]) & (table.f_hz <= band_hz[1])
+        return float(powers[:, within].sum(axis=1).max())
+
+    if table.f_hz[0] > _SLOW_BAND_HZ[1]:
+        # Klipper before 2024-12 cuts normalised tables at 5 Hz (shaper_calibrate.py, 16b4b6b30).
+        return False
+    slow = largest(_SLOW_BAND_HZ)
+    least, most = np.square(_SLOW_IN_TABLE_MM_S2)
+    if slow >= most and slow >= _LEAST_SLOW * largest(_ABOVE_HZ):
+        return True
+    moved = largest((0.0, math.inf)) >= _MOVED_MM_S2**2
+    return False if slow <= least and moved else None
 
 
 def _sweeps(log: AccelerationLog, period_s: float) -> bool | None:
@@ -302,17 +332,22 @@ def _sweeps(log: AccelerationLog, period_s: float) -> bool | None:
     return False if slow_mm_s2 <= _SLOW_MM_S2[0] and moved_mm_s2 >= _MOVED_MM_S2 else None
 
 
-def _era(made: date | None, settings: ReadSettings, *, by_log: bool) -> str:
+def _kind(measurement: AccelerationLog | Spectrum) -> str:
+    return "table" if isinstance(measurement, Spectrum) else "log"
+
+
+def _era(made: date | None, settings: ReadSettings, *, shows: str) -> str:
+    """Say why the defaults are those of a time; `shows`: the kind of file that says another."""
     if made is None:
-        if by_log:
-            return "before 2024-12, because the log shows no slow sweep"
+        if shows:
+            return f"before 2024-12, because the {shows} shows no slow sweep"
         return (
             "since 2024-12, because no date is known (give firmware_date if the firmware is older)"
         )
     old = _is_old(made)
     told = "firmware_date" if settings.firmware_date else "the date in the file's name"
-    if by_log:
-        era, shows = ("since 2024-12", "a") if old else ("before 2024-12", "no")
-        return f"{era}, because the log shows {shows} slow sweep, whatever {told}, {made}, says"
+    if shows:
+        era, a = ("since 2024-12", "a") if old else ("before 2024-12", "no")
+        return f"{era}, because the {shows} shows {a} slow sweep, whatever {told}, {made}, says"
     era = "before 2024-12" if old else "since 2024-12"
     return f"{era} by {told}, {made.isoformat()}"

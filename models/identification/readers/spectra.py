@@ -109,7 +109,7 @@ def _unrounded(f_hz: Array, table: Table) -> Array:
 def _undone(f_hz: Array, psd: Array, *, smooth: bool) -> tuple[Array, Array]:
     """Undo the division by f + 0.1 and the suppression of low frequencies.
 
-    Below twice MIN_FREQ, exp(1 - (10/(f+0.1))^2); in versions of 2020, zero below MIN_FREQ;
+    Below twice MIN_FREQ, exp(1 - (10/(f+0.1))^2); before 2024-12, zero below MIN_FREQ;
     in Kalico (told by its smooth shapers), tanh(f/10) everywhere.
     """
     low = f_hz < 2 * _MIN_FREQ_HZ

@@ -22,7 +22,7 @@ from stillpath.models.identification.messages import phase_warning, spectrum_lev
 from stillpath.models.identification.modal_fit import fit_modes
 from stillpath.models.identification.prompt import prompt
 from stillpath.models.identification.readers import ReadSettings, read_content
-from stillpath.models.identification.synthetic import Sensor
+from stillpath.models.identification.synthetic import Sensor, simulate_spectrum
 from stillpath.models.identification.trust import check_informative
 from stillpath.models.identification.types import (
     AccelerationLog,
@@ -47,8 +47,10 @@ from stillpath.models.schedule import AxisSchedule, MassSchedule
 from tests.models.identification.recordings import (
     LEGACY,
     QUICK,
+    QUICK_SENSOR,
     QUICK_SETTINGS,
     SWEEPING,
+    along,
     one_mode,
     quick_log,
     quick_raw,
@@ -532,9 +534,50 @@ def test_strengths_of_the_test_are_operating_points() -> None:
 
 @pytest.mark.parametrize("gain", [0.6, 1.4])
 def test_a_level_that_is_too_low_may_be_friction(gain: float) -> None:
-    (warning,) = spectrum_level_warning(gain, LEGACY)
+    (warning,) = spectrum_level_warning(gain, LEGACY, "table.csv")
     assert f"implies accel_per_hz = {75 * gain:.0f}" in warning
     assert ("rubs much" in warning) == (gain < 1.0)
+
+
+TABLES = SETTINGS.model_copy(update={"f_end_hz": 80.0})
+
+
+def quick_table(axis: str, sensor: Sensor = QUICK_SENSOR) -> Measured:
+    truth = {"x": one_mode(42.0, 0.06), "y": one_mode(35.0, 0.08)}
+    rng = np.random.default_rng(0)
+    found = simulate_spectrum(
+        truth, along(axis, replace(QUICK, f_end_hz=80.0)), sensor=sensor, rng=rng
+    )
+    return Measured(replace(found, axis=axis, source=f"resonances_{axis}_1.csv"))
+
+
+@pytest.mark.parametrize("gain", [0.0, 0.1, 7.0])
+def test_a_table_of_something_else_is_refused(gain: float) -> None:
+    """Noise alone, or the head of a bed slinger in the test of its bed, made a model."""
+    with pytest.raises(ModelError, match=r"_x_1\.csv: .* times as much as a test with accel_per"):
+        identify([quick_table("x", replace(QUICK_SENSOR, gain=gain))], TABLES, max_order=1)
+
+
+def test_one_axis_in_the_tables_of_both_is_refused() -> None:
+    """The table of X, given for Y too, made two axes alike."""
+    round_z = replace(QUICK_SENSOR, rotation=TURNED_ROUND_Z)
+    tables = [quick_table("x"), quick_table("y", round_z)]
+    with pytest.raises(ModelError, match=r"_x_1\.csv, resonances_y_1\.csv: .* measured twice"):
+        identify(tables, TABLES, max_order=1)
+    turned = TABLES.model_copy(update={"sensor_turned": True})
+    found = identify(tables, turned, max_order=1)
+    assert not any("mounted so" in note for note in found["x"].notes)
+    assert any("sensor's x moved in the test of axis y" in note for note in found["y"].notes)
+
+
+def test_a_sensor_that_is_turned_for_both_axes_is_no_fault() -> None:
+    for rotation in (TURNED_ROUND_Z, TURNED_BY_45):
+        sensor = replace(QUICK_SENSOR, rotation=rotation)
+        tables = [quick_table("x", sensor), quick_table("y", sensor)]
+        assert list(identify(tables, TABLES, max_order=1)) == ["x", "y"]
+
+
+TURNED_BY_45 = ((0.5**0.5, 0.5**0.5, 0.0), (-(0.5**0.5), 0.5**0.5, 0.0), (0.0, 0.0, 1.0))
 
 
 def test_spectra_of_different_tests_have_no_mean() -> None:

@@ -10,7 +10,10 @@ import pytest
 from pydantic import ValidationError
 
 from stillpath.models.errors import ModelError
-from stillpath.models.identification.excitation import drive_spectrum
+from stillpath.models.identification.excitation import (
+    drive_spectrum,
+    drive_spectrum_regenerated,
+)
 from stillpath.models.identification.readers import (
     ReadSettings,
     date_in_name,
@@ -87,6 +90,57 @@ def test_a_log_that_hardly_moves_tells_nothing() -> None:
     assert excitation_for(log) == NEW
 
 
+def simulated_table(
+    test: Excitation, source: str, *, accel_per_hz_mm_s: float | None = None, sets: bool = False
+) -> Spectrum:
+    """What Klipper writes of a test that the sensor follows exactly."""
+    f_hz = np.arange(130) * 1.5625
+    density = drive_spectrum_regenerated(test, f_hz) + 5.0
+    psd = {"head": density, "bed": np.full(130, 5.0)} if sets else {"x": density}
+    return Spectrum(f_hz, psd, "x", source, accel_per_hz_mm_s)
+
+
+@pytest.mark.parametrize("sets", [False, True])
+@pytest.mark.parametrize(
+    ("test", "name", "words"),
+    [
+        (OLD, "20260601_101010", "the table shows no slow sweep, whatever the date"),
+        (OLD, "mine", "before 2024-12, because the table shows no slow sweep"),
+        (OLD, "20230601_101010", "before 2024-12 by the date"),
+        (NEW, "20230601_101010", "because the table shows a slow sweep"),
+        (NEW, "20260601_101010", "since 2024-12 by the date"),
+        (NEW, "mine", "since 2024-12, because no date is known"),
+    ],
+)
+def test_tables_tell_which_test_they_are_of(
+    test: Excitation, name: str, words: str, sets: bool
+) -> None:
+    """Printers of 2026 with a Klipper of 2022, and Kalico, do not sweep slowly."""
+    table = simulated_table(test, f"resonances_x_{name}.csv", sets=sets)
+    assert excitation_for(table) == test
+    (note,) = excitation_notes(table)
+    assert words in note
+
+
+def test_tables_cut_at_5_hz_are_of_a_klipper_that_does_not_sweep() -> None:
+    table = simulated_table(NEW, "calibration_data_x_20260601.csv")
+    cut = replace(table, f_hz=table.f_hz[4:], psd={"x": table.psd["x"][4:]})
+    assert excitation_for(cut) == OLD
+
+
+def test_kalico_does_not_sweep_slowly() -> None:
+    test = replace(OLD, accel_per_hz_mm_s=60.0, f_end_hz=135.0)
+    table = simulated_table(test, "resonances_x_20260601.csv", accel_per_hz_mm_s=60.0)
+    told = excitation_for(table)
+    assert (told.accel_per_hz_mm_s, told.sweeping_accel_mm_s2) == (60.0, 0.0)
+
+
+def test_strong_shaking_is_no_slow_sweep() -> None:
+    test = replace(OLD, accel_per_hz_mm_s=300.0)
+    table = simulated_table(test, "resonances_x_20230601.csv")
+    assert excitation_for(table).sweeping_accel_mm_s2 == 0.0
+
+
 @pytest.mark.parametrize(
     ("max_freq", "last_hz", "expected"),
     [(100, 150.0, 100.0), (100, 149.2, 100.0), (300, 449.6, 300.0), (135, 201.6, 135.0),
@@ -112,8 +166,9 @@ def test_a_table_wider_than_its_test_keeps_the_default() -> None:
         (135.0, Spectrum(f_hz, {"x": density}, "x", "resonances_x_20260101.csv")),
         (265.0, Spectrum(f_hz, {"x": np.square(f_hz)}, "x", "resonances_x_20260101.csv")),
     ):
-        assert excitation_for(table).f_end_hz == max_freq
-        notes = excitation_notes(table)
+        settings = ReadSettings(sweeping_accel_mm_s2=400.0)
+        assert excitation_for(table, settings).f_end_hz == max_freq
+        notes = excitation_notes(table, settings)
         assert any("so max_freq is" in note for note in notes) == (max_freq == 265.0)
         assert any("max_freq 135" in note for note in notes) == (max_freq == 135.0)
 

@@ -187,6 +187,18 @@ def test_tables_of_a_machine_that_was_changed_between_them_are_told() -> None:
     assert note.startswith(("before.csv and after.csv differ by", "again.csv and after.csv differ"))
 
 
+def test_interpolated_tables_count_by_bin() -> None:
+    """Klipper writes several data sets every 0.2 Hz: eight times the numbers, and no more known."""
+    single = simulated(NARROW, (0.7, 0.3), LEGACY)
+    f_hz = np.arange(0.0, 200.0, 0.2)
+    fine = replace(single, f_hz=f_hz, psd={"head": np.interp(f_hz, single.f_hz, single.psd["x"])})
+    own, thinned = (
+        spectrum_model(s, column, LEGACY) for s, column in ((single, "x"), (fine, "head"))
+    )
+    assert len(thinned.f_hz) == pytest.approx(len(own.f_hz), abs=3)
+    assert np.diff(thinned.f_hz) == pytest.approx(1.6)
+
+
 @pytest.mark.slow
 def test_column_that_follows_the_drive() -> None:
     spectrum = simulated(NARROW, (0.7, 0.3), LEGACY)
@@ -196,6 +208,17 @@ def test_column_that_follows_the_drive() -> None:
     assert explain_spectra([turned], LEGACY).fit.spec == narrow().explained().fit.spec
     with pytest.raises(ModelError, match="no column 'q'; there are x, z"):
         explain_spectra([turned], LEGACY, column="q")
+
+
+def test_column_of_a_test_that_begins_above_15_hz() -> None:
+    """Below its start the axis of the sensor that hisses most was taken to follow it."""
+    test = replace(LEGACY, f_start_hz=20.0)
+    spectrum = simulated(NARROW, (0.7, 0.3), test)
+    z = np.where(spectrum.f_hz < 18.0, 2.0 * spectrum.psd["x"], spectrum.psd["y"])
+    hissing = replace(spectrum, psd={**spectrum.psd, "z": z})
+    assert driven_column(hissing) == "z"
+    assert driven_column(hissing, test.f_start_hz) == "x"
+    assert explanations([hissing], test, max_order=1).column == "x"
 
 
 @pytest.mark.slow
