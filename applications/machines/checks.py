@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from stillpath.applications.machines.klipper_config import Fact, PrinterConfig, facts
 from stillpath.models.errors import ModelError
+from stillpath.models.firmware import Klipper
 from stillpath.models.firmware.common import AxisAllowance
 from stillpath.models.machine import AxisLimits, CommandLimits, Machine, MotorLimits
 from stillpath.models.store import explain
@@ -278,18 +279,23 @@ def derived_envelope(machine: Machine) -> CommandLimits:
 
 def _borne(machine: Machine, allowed: AxisAllowance) -> dict[str, float]:
     step = _CORNERS * allowed.corner_mm_s
+    room = 1.0 if _capped(machine) else _SPEED_ROOM
     return {
-        "velocity_mm_s": _SPEED_ROOM * allowed.speed_mm_s,
+        "velocity_mm_s": room * allowed.speed_mm_s,
         "accel_mm_s2": _accel_borne(machine, allowed.accel_mm_s2),
         "speed_step_mm_s": min(max(step, _LEAST_STEP_MM_S), CommandLimits().speed_step_mm_s),
     }
 
 
 def _accel_borne(machine: Machine, allowed_mm_s2: float) -> float:
-    usual = _ACCEL_ROOM * allowed_mm_s2
+    usual = allowed_mm_s2 if _capped(machine) else _ACCEL_ROOM * allowed_mm_s2
     if machine.firmware.kind != "marlin":
         return usual
     return max(usual, min(_MARLIN_ROOM * allowed_mm_s2, _MARLIN_MM_S2))
+
+
+def _capped(machine: Machine) -> bool:
+    return isinstance(machine.firmware, Klipper) and machine.firmware.limits_capped
 
 
 def with_firmware(machine: Machine, section: dict[str, Any]) -> Machine:
