@@ -181,6 +181,7 @@ def machine_from_config(config: PrinterConfig, stated: StatedMachine) -> Machine
         If the configuration lacks something, or is of an unknown kind of machine.
     """
     _check_kinematics(config)
+    _check_shaper(config)
     found = facts(config)
     shaper_hz = {fact.place: fact.value for fact in found}
     document: dict[str, Any] = {
@@ -224,6 +225,23 @@ def _check_kinematics(config: PrinterConfig) -> None:
         f"{plain} and {least} there, without max_x_accel and max_y_accel, or use simulate and "
         "advise with a copy that says so"
     )
+
+
+def _check_shaper(config: PrinterConfig) -> None:
+    """Refuse a firmware that keeps its shaper elsewhere, and changes that with every file.
+
+    Snapmaker's for the U1: its SET_INPUT_SHAPER writes into input_shaper.json, where its own
+    measurement is (klippy/extras/input_shaper.py, 2026-04).
+    """
+    keeps = "shaper_freq_x_min"
+    if config.text("input_shaper", keeps) is not None:
+        raise ModelError(
+            f"{config.name}: [input_shaper] {keeps}: this is Snapmaker's Klipper, which keeps the "
+            "shaper that it measured in input_shaper.json, and a file that switches the shaper off "
+            "and on again would write the frequencies of printer.cfg over it. Put types, "
+            "frequencies and damping of input_shaper.json into [input_shaper] of printer.cfg, and "
+            "give a copy of it without shaper_freq_x_min, _x_max, _y_min and _y_max"
+        )
 
 
 def not_followed(config: PrinterConfig) -> list[str]:

@@ -342,6 +342,17 @@ def test_a_firmware_that_caps_limits_is_recognised(store: MachineStore, config: 
     assert "firmware.limits_capped" in found.text
 
 
+def test_a_fork_that_keeps_its_shaper_elsewhere(store: MachineStore, config: Path, capsys):
+    """Snapmaker's, of the U1: a file would write over what it has measured."""
+    kept = CONFIG.replace("shaper_type_x: ei", "shaper_type_x: ei\nshaper_freq_x_min: 47.5")
+    config.write_text(kept)
+    assert machines("from-config", config, "--name", "u1") == 2
+    told = capsys.readouterr().err
+    assert "shaper_freq_x_min" in told
+    assert "input_shaper.json" in told
+    assert "u1" not in store.names()
+
+
 def test_limits_by_axis_of_a_fork_are_told_apart(store: MachineStore, config: Path, capsys):
     by_axis = "kinematics: limited_corexy\nmax_x_accel: 8000\nmax_y_accel: 3000"
     config.write_text(CONFIG.replace("kinematics: corexy", by_axis))
