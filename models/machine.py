@@ -214,8 +214,9 @@ class Machine(Document):
             del content["firmware"]["ft_motion"]
         if not content["firmware"].get("macros", True):
             del content["firmware"]["macros"]
-        if not content["firmware"].get("arc_circles", True):
-            del content["firmware"]["arc_circles"]
+        for added in ("arc_circles", "limits_capped"):
+            if not content["firmware"].get(added, True):
+                del content["firmware"][added]
         if content["firmware"].get("ft_motion_version") == 2:
             del content["firmware"]["ft_motion_version"]
         document = json.dumps(content, sort_keys=True, separators=(",", ":"))

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from stillpath.applications.machines.klipper_config import Fact, PrinterConfig, facts
 from stillpath.models.errors import ModelError
+from stillpath.models.firmware import Klipper
 from stillpath.models.firmware.common import AxisAllowance
 from stillpath.models.machine import AxisLimits, CommandLimits, Machine, MotorLimits
 from stillpath.models.store import explain
@@ -180,6 +181,7 @@ def machine_from_config(config: PrinterConfig, stated: StatedMachine) -> Machine
         If the configuration lacks something, or is of an unknown kind of machine.
     """
     _check_kinematics(config)
+    _check_shaper(config)
     found = facts(config)
     shaper_hz = {fact.place: fact.value for fact in found}
     document: dict[str, Any] = {
@@ -223,6 +225,23 @@ def _check_kinematics(config: PrinterConfig) -> None:
         f"{plain} and {least} there, without max_x_accel and max_y_accel, or use simulate and "
         "advise with a copy that says so"
     )
+
+
+def _check_shaper(config: PrinterConfig) -> None:
+    """Refuse a firmware that keeps its shaper elsewhere, and changes that with every file.
+
+    Snapmaker's for the U1: its SET_INPUT_SHAPER writes into input_shaper.json, where its own
+    measurement is (klippy/extras/input_shaper.py, 2026-04).
+    """
+    keeps = "shaper_freq_x_min"
+    if config.text("input_shaper", keeps) is not None:
+        raise ModelError(
+            f"{config.name}: [input_shaper] {keeps}: this is Snapmaker's Klipper, which keeps the "
+            "shaper that it measured in input_shaper.json, and a file that switches the shaper off "
+            "and on again would write the frequencies of printer.cfg over it. Put types, "
+            "frequencies and damping of input_shaper.json into [input_shaper] of printer.cfg, and "
+            "give a copy of it without shaper_freq_x_min, _x_max, _y_min and _y_max"
+        )
 
 
 def not_followed(config: PrinterConfig) -> list[str]:
@@ -278,18 +297,23 @@ def derived_envelope(machine: Machine) -> CommandLimits:
 
 def _borne(machine: Machine, allowed: AxisAllowance) -> dict[str, float]:
     step = _CORNERS * allowed.corner_mm_s
+    room = 1.0 if _capped(machine) else _SPEED_ROOM
     return {
-        "velocity_mm_s": _SPEED_ROOM * allowed.speed_mm_s,
+        "velocity_mm_s": room * allowed.speed_mm_s,
         "accel_mm_s2": _accel_borne(machine, allowed.accel_mm_s2),
         "speed_step_mm_s": min(max(step, _LEAST_STEP_MM_S), CommandLimits().speed_step_mm_s),
     }
 
 
 def _accel_borne(machine: Machine, allowed_mm_s2: float) -> float:
-    usual = _ACCEL_ROOM * allowed_mm_s2
+    usual = allowed_mm_s2 if _capped(machine) else _ACCEL_ROOM * allowed_mm_s2
     if machine.firmware.kind != "marlin":
         return usual
     return max(usual, min(_MARLIN_ROOM * allowed_mm_s2, _MARLIN_MM_S2))
+
+
+def _capped(machine: Machine) -> bool:
+    return isinstance(machine.firmware, Klipper) and machine.firmware.limits_capped
 
 
 def with_firmware(machine: Machine, section: dict[str, Any]) -> Machine:

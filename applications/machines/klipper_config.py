@@ -26,6 +26,9 @@ __all__ = [
     "read_printer_config",
 ]
 
+_CAPS = "max_velocity_silent"
+"""An option of Elegoo's Centauri Carbon, where SET_VELOCITY_LIMIT and M204 stop at printer.cfg's
+limits (elegooofficial/CentauriCarbon, firmware/core/klippy/toolhead.cpp, 2025-09)."""
 _LARGEST_BYTES = 4_000_000
 _SAVED_PREFIX = "#*# "
 _SECTION = re.compile(r"\[(?P<name>[^]]+)\]\s*$")
@@ -207,7 +210,7 @@ def _printer(config: PrinterConfig) -> list[Fact]:
         )
     else:
         ratio = config.number(section, option, ratio)
-    planner = "firmware.planner"
+    planner, options = "firmware.planner", config.sections[section]
     return [
         Fact(section, "kinematics", "kinematics", config.text(section, "kinematics")),
         Fact(section, "max_velocity", f"{planner}.max_velocity_mm_s", velocity),
@@ -220,6 +223,8 @@ def _printer(config: PrinterConfig) -> list[Fact]:
             ("max_z_velocity", f"{planner}.max_z_velocity_mm_s", velocity),
             ("max_z_accel", f"{planner}.max_z_accel_mm_s2", accel),
         ),
+        # Only a firmware that has this option is known to cap what a file sets.
+        *(Fact(section, name, "firmware.limits_capped", True) for name in {_CAPS} & options.keys()),
     ]
 
 

@@ -84,11 +84,26 @@ def firmware_section(text: str, name: str) -> dict[str, Any]:
     Raises
     ------
     ModelError
-        If a command that every Marlin prints is missing or lacks a word, or units are inches.
+        If a command that every Marlin prints is missing or lacks a word, if units are inches, or
+        if the printer is a delta or has a shaper that stays on.
     """
     if re.search(r"(?m)^(?:.*:)?\s*G20\b", text):
         raise ModelError(f"{name}: the printer works in inches; send G21, then M503 again")
     found = _commands(text)
+    if "M665" in found:
+        # Printed by builds with DELTA, SCARA or POLAR alone (calibrate/M665.cpp, 2.1.x, 2024).
+        raise ModelError(
+            f"{name}: M665 says that the printer is a delta, or another one whose motors are not X "
+            "and Y; only cartesian and corexy are compensated: print on it as sliced"
+        )
+
+    if "P" in found.get("M593 X", {}):
+        # Snapmaker's for the J1 (SnapmakerController-IDEX, AxisManager.cpp, 2024-08): M593 F0 is an
+        # error there, as in no other Marlin with this word.
+        raise ModelError(
+            f"{name}: M593 X P.. says that this is the Marlin of Snapmaker's J1, whose shaper F0 "
+            "does not switch off: it would act on top of the compensation. Print on it as sliced"
+        )
 
     def word(command: str, letter: str, default: float | None = None) -> float:
         value = found.get(command, {}).get(letter)

@@ -99,6 +99,10 @@ class Klipper(FirmwareFacts):
     """Configured macros with the name of another firmware's word, such as M205 or M900: they may do
     anything."""
 
+    limits_capped: bool = False
+    """SET_VELOCITY_LIMIT and M204 set no speed and no acceleration above those of `planner`, as on
+    Elegoo's Centauri Carbon."""
+
     @property
     def hotend(self) -> Hotend:
         """Nozzle and filament."""

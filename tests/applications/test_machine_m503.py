@@ -146,6 +146,9 @@ def test_fixed_time_motion_of_both_versions(
         ("[printer]\nkinematics: corexy\n", (), ("m503.txt", "M203", "save all of")),
         (M503.replace("M92 X80.00", "M92"), (), ("M92 X",)),
         (M503.replace("G21", "G20"), (), ("inches", "G21")),
+        # As Marlin 2.1 prints it for a delta, and Snapmaker's for the J1.
+        (M503 + "echo:  M665 L215 R105.2 H330 S200\n", (), ("M665", "delta", "as sliced")),
+        (M503.replace("M593 X F", "M593 X P4 F"), (), ("M593 X P", "J1", "as sliced")),
         (M503, ("--travel", "235"), ("--travel", "235x235x250")),
         (M503, ("--set", "s_curve"), ("FIELD=VALUE",)),
         (M503, ("--set", "s_curv=true"), ("s_curv",)),

@@ -322,6 +322,37 @@ def test_what_the_motors_bear_is_derived_from_their_limits(store: MachineStore, 
     assert command.accel_mm_s2 == pytest.approx(1.5 * 30_000)
 
 
+def test_a_firmware_that_caps_limits_is_recognised(store: MachineStore, config: Path):
+    """Elegoo's Centauri Carbon: a file cannot raise speed and acceleration."""
+    silent = "max_velocity: 300\nmax_velocity_silent: 200"
+    config.write_text(CONFIG.replace("max_velocity: 300", silent))
+    assert machines("from-config", config, "--name", "mine") == 0
+    machine = store.current("mine").machine
+    assert machine.firmware.limits_capped
+    motors = MotorLimits(accel_mm_s2=5657.0)
+    assert machine.command == CommandLimits(
+        velocity_mm_s=300.0, accel_mm_s2=4000.0, speed_step_mm_s=45.0, motors=motors
+    )
+    assert differences(machine, read_printer_config(config)) == []
+    plain = machine.firmware.model_copy(update={"limits_capped": False})
+    (found,) = differences(
+        machine.model_copy(update={"firmware": plain}), read_printer_config(config)
+    )
+    assert "max_velocity_silent" in found.text
+    assert "firmware.limits_capped" in found.text
+
+
+def test_a_fork_that_keeps_its_shaper_elsewhere(store: MachineStore, config: Path, capsys):
+    """Snapmaker's, of the U1: a file would write over what it has measured."""
+    kept = CONFIG.replace("shaper_type_x: ei", "shaper_type_x: ei\nshaper_freq_x_min: 47.5")
+    config.write_text(kept)
+    assert machines("from-config", config, "--name", "u1") == 2
+    told = capsys.readouterr().err
+    assert "shaper_freq_x_min" in told
+    assert "input_shaper.json" in told
+    assert "u1" not in store.names()
+
+
 def test_limits_by_axis_of_a_fork_are_told_apart(store: MachineStore, config: Path, capsys):
     by_axis = "kinematics: limited_corexy\nmax_x_accel: 8000\nmax_y_accel: 3000"
     config.write_text(CONFIG.replace("kinematics: corexy", by_axis))

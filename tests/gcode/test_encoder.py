@@ -69,6 +69,19 @@ def test_reversals_in_a_row_are_on_time(machine: Machine) -> None:
     assert deviation(written, written.encoded.phases).max() < 12e-3
 
 
+def test_a_stream_under_limits_that_a_firmware_caps(machine: Machine) -> None:
+    """Written under a higher acceleration, it came late where the firmware did not take that."""
+    firmware = machine.firmware.model_copy(update={"limits_capped": True})
+    capped = machine.model_copy(update={"firmware": firmware})
+    assert machine.command.accel_mm_s2 > firmware.largest_accel_mm_s2
+    _, written = compensated(HEAD + "M204 S2000\n" + BODIES["corners"], capped)
+    limits = adapter(capped).stream_limits(adapter(capped).initial_limits())
+    line = adapter(capped).stream_commands().limits(limits)
+    assert b"ACCEL=%g " % firmware.largest_accel_mm_s2 in line
+    assert f"VELOCITY={firmware.fastest_mm_s:g} ".encode() in line
+    assert deviation(written, written.encoded.phases).max() < 22e-3
+
+
 @pytest.mark.parametrize("name", sorted(BODIES))
 def test_executed_is_the_command(machine: Machine, work: PieceCompensator, name: str) -> None:
     piece = pieces_of(HEAD + BODIES[name], machine)[1]

@@ -88,6 +88,22 @@ def test_limits(golden_machine: Machine) -> None:
     assert after[-1].minimum_cruise_ratio == 0
 
 
+def test_limits_that_a_firmware_caps(golden_machine: Machine) -> None:
+    """Speed and acceleration stop at the configuration's, as on the Centauri Carbon."""
+    capped = golden_machine.firmware.model_copy(update={"limits_capped": True})
+    machine = golden_machine.model_copy(update={"firmware": capped})
+    most = capped.planner  # type: ignore[union-attr]
+    line = "SET_VELOCITY_LIMIT VELOCITY=90000 ACCEL=90000 SQUARE_CORNER_VELOCITY=90\n"
+    block = run(f"M204 S90000\n{line}M204 S70\n{line}", machine)
+    after = [block.limits[k] for k in block.events.limits_id]
+    assert [one.accel_mm_s2 for one in after] == [most.max_accel_mm_s2] * 2 + [
+        70,
+        most.max_accel_mm_s2,
+    ]
+    assert after[-1].velocity_mm_s == most.max_velocity_mm_s
+    assert after[-1].square_corner_velocity_mm_s == 90
+
+
 def test_limits_of_remembered_lines(golden_machine: Machine) -> None:
     """A line that comes again sets what it set the first time, whatever was in force before it."""
     accels = [800, 4000, 800, 800, 1500, 4000, 800, 1500, 800]

@@ -140,6 +140,15 @@ def test_fixed_time_motion_is_refused_with_line_and_remedy(line: str, tmp_path: 
     assert [path.name for path in tmp_path.iterdir()] == ["in.gcode"]
 
 
+def test_ankermakes_own_limits_are_refused(tmp_path: Path, cache: Path):
+    """AnkerMake's slicer sets them in its start code, and streams would come late."""
+    with pytest.raises(GcodeError, match=r"line 2: M4899 .* as sliced"):
+        by_zpetc(
+            f"G28\nM4899 T3 ; v3 jerk and S-curve\n{PART}", machine_with("marlin"), tmp_path, cache
+        )
+    by_zpetc(f"M4899\n{HEAD}{PART}{BEHIND}", machine_with("marlin"), tmp_path, cache)
+
+
 def test_fixed_time_motion_that_is_off_or_that_the_machine_has(tmp_path: Path, cache: Path):
     for line in ("M493 S0", "M493", "M493 V", "M495 X F20", "M496"):
         by_zpetc(f"{line}\n{HEAD}{PART}{BEHIND}", machine_with("marlin"), tmp_path, cache)

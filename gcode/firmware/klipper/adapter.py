@@ -77,11 +77,15 @@ class KlipperAdapter:
     def paced(self, own: Limits, accel: float, speed: float, most: CommandLimits) -> KlipperLimits:
         """Return limits under which X and Y are quicker."""
         mine = cast(KlipperLimits, own)
-        raised = scaled(mine.accel_mm_s2, accel, most.accel_mm_s2)
+        fastest, hardest = most.velocity_mm_s, most.accel_mm_s2
+        if self._firmware.limits_capped:
+            fastest = min(fastest, self._firmware.fastest_mm_s)
+            hardest = min(hardest, self._firmware.largest_accel_mm_s2)
+        raised = scaled(mine.accel_mm_s2, accel, hardest)
         corner = math.sqrt(raised / mine.accel_mm_s2) * mine.square_corner_velocity_mm_s
         return replace(
             mine,
-            velocity_mm_s=scaled(mine.velocity_mm_s, speed, most.velocity_mm_s),
+            velocity_mm_s=scaled(mine.velocity_mm_s, speed, fastest),
             accel_mm_s2=raised,
             square_corner_velocity_mm_s=corner,
         )

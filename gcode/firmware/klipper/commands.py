@@ -40,11 +40,12 @@ _LIMITS: dict[str, tuple[str, Callable[[float], bool], str]] = {
     ),
 }
 """Parameters of SET_VELOCITY_LIMIT: what they set, which values are allowed, and that in words."""
+_CAPPED = ("velocity_mm_s", "accel_mm_s2")
 _MOST_STATES = 1000
 
 
-def velocity_limit(state: MachineState, command: Command) -> int:
-    """SET_VELOCITY_LIMIT."""
+def velocity_limit(state: MachineState, command: Command, *, capped: bool = False) -> int:
+    """SET_VELOCITY_LIMIT; `capped`: up to the speed and acceleration of printer.cfg."""
     given = state.extended(command)
     values = {}
     for key, (field, allows, allowed) in _LIMITS.items():
@@ -61,7 +62,7 @@ def velocity_limit(state: MachineState, command: Command) -> int:
     # Kalico has further ones, of Z; held back in a stream they would be lost.
     further = given.keys() - {*_LIMITS, "ACCEL_TO_DECEL"}
     kind = EventKind.STATE if further else EventKind.LIMITS
-    return state.set_limits(command, values, kind=kind)
+    return state.set_limits(command, _held(state, values) if capped else values, kind=kind)
 
 
 def reset_velocity_limit(state: MachineState, _command: Command) -> int:
@@ -74,7 +75,7 @@ def reset_velocity_limit(state: MachineState, _command: Command) -> int:
     return state.event(EventKind.UNKNOWN)
 
 
-def acceleration(state: MachineState, command: Command) -> int:
+def acceleration(state: MachineState, command: Command, *, capped: bool = False) -> int:
     """M204: S, or else the smaller of P and T; P or T alone are passed over."""
     given = state.numbers(command, "SPT")
     accel = given.get("S")
@@ -84,7 +85,8 @@ def acceleration(state: MachineState, command: Command) -> int:
         return state.set_limits(command, {})
     if not at.MIN_VALUE <= accel <= at.MAX_VALUE:
         raise state.problem(f"the value {accel:g} is out of range; it must be above 0", command)
-    return state.set_limits(command, {"accel_mm_s2": accel})
+    values = {"accel_mm_s2": accel}
+    return state.set_limits(command, _held(state, values) if capped else values)
 
 
 def set_retraction(state: MachineState, command: Command) -> int:
@@ -217,6 +219,14 @@ def activate_extruder(state: MachineState, command: Command) -> int:
     f[at.F_BASE + 3] = f[at.F_LAST + 3]
     state.note_modal()
     return state.event(EventKind.UNKNOWN)
+
+
+def _held(state: MachineState, values: Mapping[str, float]) -> dict[str, float]:
+    """Return limits as a firmware takes them that goes no higher than its configuration."""
+    most = dict(zip(state.limits_names, state.initial_limits, strict=True))
+    return {
+        name: min(value, most[name]) if name in _CAPPED else value for name, value in values.items()
+    }
 
 
 def _travel_at(state: MachineState, given: Mapping[str, str], command: Command) -> int:

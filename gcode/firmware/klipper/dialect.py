@@ -12,6 +12,7 @@ over what it lacks without a stop.
 from __future__ import annotations
 
 import re
+from functools import partial
 
 from stillpath.gcode.commands import (
     NO_ARCS,
@@ -67,6 +68,11 @@ PYTHON_WORDS: dict[str, Word] = {
     "SET_INPUT_SHAPER": flushing.shaper,
     "SET_PRESSURE_ADVANCE": flushing.pressure_advance,
     "TUNING_TOWER": commands.tuning_tower,
+}
+
+CAPPED_WORDS: dict[str, Word] = {
+    "M204": partial(commands.acceleration, capped=True),
+    "SET_VELOCITY_LIMIT": partial(commands.velocity_limit, capped=True),
 }
 
 RETRACTION_WORDS: dict[str, Word] = {
@@ -153,6 +159,7 @@ def klipper(firmware: Klipper) -> Dialect:
         **KERNEL_WORDS,
         **(ARC_WORDS if firmware.arcs else {}),
         **PYTHON_WORDS,
+        **(CAPPED_WORDS if firmware.limits_capped else {}),
         **(RETRACTION_WORDS if firmware.retraction else {}),
     }
     return Dialect(

@@ -70,6 +70,9 @@ def stream_limits(
     if mesh_slope > 0.0:
         accel = min(accel, firmware.planner.max_z_accel_mm_s2 / mesh_slope)
         velocity_mm_s = min(velocity_mm_s, firmware.planner.max_z_velocity_mm_s / mesh_slope)
+    if firmware.limits_capped:
+        accel = min(accel, firmware.planner.max_accel_mm_s2)
+        velocity_mm_s = min(velocity_mm_s, firmware.planner.max_velocity_mm_s)
     return KlipperLimits(
         velocity_mm_s=velocity_mm_s,
         accel_mm_s2=accel,

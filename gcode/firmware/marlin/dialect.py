@@ -150,6 +150,8 @@ STEPS: dict[str, Word] = {
         "M493 M494",
         commands.not_modelled(EventKind.UNKNOWN, "fixed-time motion is not modelled"),
     ),
+    # AnkerMake's: another set of limits, S-curve on or off.
+    "M4899": commands.not_modelled(EventKind.UNKNOWN, "the limits that it sets are not known"),
     "M495": commands.resonance_test,
     "M496": EventKind.HARMLESS,
 }

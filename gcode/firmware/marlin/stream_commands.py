@@ -28,6 +28,9 @@ _NOTES = (
 _FIXED_TIME = re.compile(rb"\s*(?:N\d+\s*)?M493(?!\d)\s*(?!V\s*(?:[;*]|$))[A-Z]", re.IGNORECASE)
 _FIXED_TIME_OFF = re.compile(rb"[^;]*\bM493(?!\d)[^;]*S0+(?![\d.])", re.IGNORECASE)
 
+# AnkerMake-Marlin, gcode/anker_gcode/M4200_M4900.cpp and config/M200-M205.cpp (2023-09).
+_ANKER = re.compile(rb"\s*(?:N\d+\s*)?M4899(?!\d)[^;]*T", re.IGNORECASE)
+
 
 class MarlinStreamCommands:
     """Lines that Marlin understands; see `gcode.firmware.base.StreamCommands`.
@@ -108,7 +111,12 @@ class MarlinStreamCommands:
         return f"M900 K{_number(k_s)}\n".encode() if self._advances and k_s > 0.0 else b""
 
     def conflict(self, line: bytes) -> str | None:
-        """Return why not, for a line that switches fixed-time motion on."""
+        """Return why not, for a line that switches another kind of motion on."""
+        if _ANKER.match(line):
+            return (
+                "M4899 T is of AnkerMake's Marlin, which sets limits and S-curve by it, and cuts "
+                "down those of M201 to M205 that a stream needs: print as sliced"
+            )
         if not _FIXED_TIME.match(line) or _FIXED_TIME_OFF.match(line):
             return None
         return (
