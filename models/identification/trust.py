@@ -190,7 +190,7 @@ def check_directions(found: Iterable[AxisIdentification], *, stated: bool = Fals
                 f"({x_share:.0%} and {y_share:.0%} of the power from 8 to 15 Hz, where tests of "
                 f"two axes share less than {_ONE_DIRECTION:.0%}): the same axis was measured "
                 "twice, so measure the other one; if the sensor was mounted differently for X and "
-                "for Y, say so (option sensor_turned)"
+                "for Y, say so (option sensor_turned), or give one axis at a time"
             )
 
 
