@@ -30,6 +30,8 @@ __all__ = [
 _LEAST_SHARE, _LEAST_COUNT = 0.1, 30
 _PRINTERS_HZ = 150.0
 """Printers have their modes below this frequency: a model need not follow above it."""
+_HIGHEST_TEST_HZ, _WIDER = 300.0, 1.4
+"""Klipper's largest max_freq, and how far a test should go beyond a resonance."""
 _MAIN_HZ = (1.0, 500.0)
 """As for a resonance that is typed in."""
 _UNSEEN_ZETA = 0.03
@@ -80,7 +82,7 @@ def check_informative(
         raise ModelError(
             f"{names}: the mode that rings most would be at {main.f_hz:.1f} Hz, outside the "
             f"measured {low:.1f} to {high:.1f} Hz, so it was not measured. "
-            f"{told}{_MEASURE}"
+            f"{told}{_above(main.f_hz) if high < main.f_hz < _HIGHEST_TEST_HZ else _MEASURE}"
         )
     if not _MAIN_HZ[0] <= main.f_hz <= _MAIN_HZ[1]:
         raise ModelError(
@@ -95,6 +97,15 @@ def check_informative(
             f"{2 * main.f_sd_hz:.1f} Hz; it must be known within {2 * _MOST_UNSURE:.0%} to be "
             f"compensated. {told}{_MEASURE}"
         )
+
+
+def _above(f_hz: float) -> str:
+    """Say how to measure a mode above what was measured."""
+    most_hz = min(10.0 * np.ceil(0.1 * _WIDER * f_hz), _HIGHEST_TEST_HZ)
+    return (
+        f"Measure up to {most_hz:.0f} Hz (Klipper: max_freq in [resonance_tester]; a lower "
+        "accel_per_hz keeps the acceleration as it was), with the sensor on what moves"
+    )
 
 
 def main_mode(fit: Fit) -> ModeEstimate | None:
@@ -179,7 +190,7 @@ def check_directions(found: Iterable[AxisIdentification], *, stated: bool = Fals
                 f"({x_share:.0%} and {y_share:.0%} of the power from 8 to 15 Hz, where tests of "
                 f"two axes share less than {_ONE_DIRECTION:.0%}): the same axis was measured "
                 "twice, so measure the other one; if the sensor was mounted differently for X and "
-                "for Y, say so (option sensor_turned)"
+                "for Y, say so (option sensor_turned), or give one axis at a time"
             )
 
 

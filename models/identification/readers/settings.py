@@ -28,8 +28,9 @@ Column = str | Annotated[int, Field(ge=0)]
 _NEW_TEST = date(2024, 12, 1)
 _TELLS_RANGE = date(2024, 2, 17)
 """Since then a table ends at 1.5 max_freq (klippy/extras/resonance_tester.py), before at 200 Hz."""
+_PER_HZ = "accel_per_hz"
 _KLIPPER = {
-    "accel_per_hz_mm_s": "accel_per_hz",
+    "accel_per_hz_mm_s": _PER_HZ,
     "f_start_hz": "min_freq",
     "f_end_hz": "max_freq",
     "hz_per_s": "hz_per_sec",
@@ -162,7 +163,7 @@ def direction_of(axis: str, *, allow_z: bool = False) -> tuple[float, float]:
 def excitation_for(
     measurement: AccelerationLog | Spectrum, settings: ReadSettings | None = None
 ) -> Excitation:
-    """Return the firmware's resonance test: the file first, then the settings, then defaults.
+    """Return the firmware's resonance test: the settings first, then the file, then defaults.
 
     Defaults of klippy/extras/resonance_tester.py: before 2024-12 from 5 to 133.33 Hz with
     75 mm/s and without the slow square wave; since then from 5 to 135 Hz with 60 mm/s,
@@ -218,9 +219,13 @@ def _resolved(measurement: AccelerationLog | Spectrum, settings: ReadSettings) -
         "sweeping_accel_mm_s2": settings.sweeping_accel_mm_s2,
         "sweeping_period_s": settings.sweeping_period_s,
     }
-    if isinstance(measurement, Spectrum) and measurement.accel_per_hz_mm_s is not None:
-        given["accel_per_hz_mm_s"] = measurement.accel_per_hz_mm_s
     found: list[str] = []
+    written = measurement.accel_per_hz_mm_s if isinstance(measurement, Spectrum) else None
+    if written is not None:
+        # Kalico writes that of printer.cfg, also where the command gave another (2026-07).
+        stated = given["accel_per_hz_mm_s"] = given["accel_per_hz_mm_s"] or written
+        if stated != written:
+            found.append(f"{_PER_HZ} {stated:g} was stated, {written:g} in the file does not count")
     tells_range = made is None or made >= _TELLS_RANGE
     if isinstance(measurement, Spectrum) and tells_range and settings.f_end_hz is None:
         given["f_end_hz"] = _end_of_range(measurement, defaults.f_end_hz)

@@ -89,7 +89,7 @@ function testOptions() {
   const inputs = TEST.map(([name, , hint]) => h("input", { type: "number", id: `test-${name}`, min: "0", step: "any", placeholder: hint }));
   const axis = h("select", { id: "test-axis" }, [["", "As the files say"], ["x", "X"], ["y", "Y"]].map(([value, text]) => h("option", { value }, text)));
   const element = h("details", null, h("summary", null, "How the test was run"),
-    h("p.hint", null, "Empty: as the file says, else Klipper's default as shown; in brackets that for files whose name has a date before 2024-12. Of a table of resonances only what lies between From and To is fitted."),
+    h("p.hint", null, "Empty: as the file says, else Klipper's default as shown; in brackets that of Klipper before 2024-12. Of a table of resonances only what lies between From and To is fitted."),
     h("div.fields", null,
       h("div.field", null, h("label", { for: "test-axis" }, "Axis"), axis),
       TEST.map(([name, label], k) => h("div.field", null, h("label", { for: `test-${name}` }, label), inputs[k]))));

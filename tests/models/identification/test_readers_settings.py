@@ -173,15 +173,19 @@ def test_a_table_wider_than_its_test_keeps_the_default() -> None:
         assert any("max_freq 135" in note for note in notes) == (max_freq == 135.0)
 
 
-def test_file_before_settings_before_defaults() -> None:
+def test_settings_before_file_before_defaults() -> None:
+    """Kalico writes accel_per_hz of printer.cfg, also of a test with another."""
     settings = ReadSettings(accel_per_hz_mm_s=90, f_end_hz=200, firmware_date=date(2023, 1, 1))
     told = excitation_for(spectrum("a.csv", "1,-1", 100.0), settings)
-    assert told.accel_per_hz_mm_s == 100.0
+    assert told.accel_per_hz_mm_s == 90.0
     assert told.f_end_hz == 200.0
     assert told.sweeping_accel_mm_s2 == 0.0
     np.testing.assert_allclose(told.direction, (np.sqrt(0.5), -np.sqrt(0.5)))
-    assert excitation_for(spectrum("a.csv"), settings).accel_per_hz_mm_s == 90.0
-    (note,) = excitation_notes(spectrum("a.csv", "x", 100.0), settings)
+    notes = excitation_notes(spectrum("a.csv", "x", 100.0), settings)
+    assert notes[0] == "accel_per_hz 90 was stated, 100 in the file does not count"
+    unstated = settings.model_copy(update={"accel_per_hz_mm_s": None})
+    assert excitation_for(spectrum("a.csv", "x", 100.0), unstated).accel_per_hz_mm_s == 100.0
+    (note,) = excitation_notes(spectrum("a.csv", "x", 100.0), unstated)
     assert "accel_per_hz" not in note
     assert "f_end_hz" not in note
 
