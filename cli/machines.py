@@ -429,7 +429,7 @@ def _what_m503_leaves(machine: Machine, text: str, fields: Sequence[str]) -> Ite
     assumed = [
         f"{field}={str(value).lower()}"
         for field, value in marlin_settings.ASSUMED.items()
-        if field not in said
+        if field not in said and getattr(machine.firmware, field) == value
     ]
     if assumed:
         yield f"assumed, for M503 does not say it: {', '.join(assumed)}; --set says otherwise"

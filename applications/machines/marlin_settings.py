@@ -128,6 +128,9 @@ def firmware_section(text: str, name: str) -> dict[str, Any]:
         ),
     }
     section: dict[str, Any] = {}
+    if "M970" in found or "Prusa-Firmware-Buddy" in text:
+        # Phase stepping, which only that firmware has (configuration_store.cpp, 2025-04), or M115.
+        section["variant"] = "prusa"
     if "M493" in found:
         # Version 1 reports Y's frequency as B, version 2 one line for each axis.
         section["ft_motion_version"] = 1 if "B" in found["M493"] else 2

@@ -66,6 +66,17 @@ def stored(capsys: pytest.CaptureFixture[str]):
     return read_machine(capsys.readouterr().out.encode(), "mine")
 
 
+@pytest.mark.parametrize(
+    "line", ["echo:  M970 X1 Y0", "FIRMWARE_NAME:Prusa-Firmware-Buddy 6.2.4+8909 (Github)"]
+)
+def test_a_buddy_is_none_of_marlins_releases(make, capsys, line: str) -> None:
+    """Prusa's printers answer M503 as others do, and were taken for one that takes a stream."""
+    code, out, _ = make(f"{line}\n{M503}")
+    assert (code, stored(capsys).firmware.variant) == (0, "prusa")
+    assert "variant=2.1" not in out
+    assert "use method advise" in out
+
+
 def test_axes_that_begin_beside_the_bed(make, capsys) -> None:
     """Start codes of Creality's printers draw a line at X-2.1 there."""
     assert make(M503, "--travel=-4:220x-17:227x250")[0] == 0
