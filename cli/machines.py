@@ -374,7 +374,12 @@ def from_m503(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="What Marlin answers to M503.")],
     made: NewMachine,
     travel: Annotated[
-        str, typer.Option(metavar="XxYxZ", help="How far the axes reach, mm: 235x235x250.")
+        str,
+        typer.Option(
+            metavar="XxYxZ",
+            help="How far the axes reach, mm: 235x235x250, or --travel=-4:220x-17:227x250 "
+            "(X_MIN_POS and X_MAX_POS of Configuration.h).",
+        ),
     ],
     kinematics: Annotated[str, typer.Option(help="cartesian or corexy.")] = "cartesian",
     fields: Annotated[
@@ -424,7 +429,7 @@ def _what_m503_leaves(machine: Machine, text: str, fields: Sequence[str]) -> Ite
     assumed = [
         f"{field}={str(value).lower()}"
         for field, value in marlin_settings.ASSUMED.items()
-        if field not in said
+        if field not in said and getattr(machine.firmware, field) == value
     ]
     if assumed:
         yield f"assumed, for M503 does not say it: {', '.join(assumed)}; --set says otherwise"

@@ -128,6 +128,9 @@ def firmware_section(text: str, name: str) -> dict[str, Any]:
         ),
     }
     section: dict[str, Any] = {}
+    if "M970" in found or "Prusa-Firmware-Buddy" in text:
+        # Phase stepping, which only that firmware has (configuration_store.cpp, 2025-04), or M115.
+        section["variant"] = "prusa"
     if "M493" in found:
         # Version 1 reports Y's frequency as B, version 2 one line for each axis.
         section["ft_motion_version"] = 1 if "B" in found["M493"] else 2
@@ -150,7 +153,7 @@ def machine_from_m503(
     file: str,
     stated: StatedMachine,
     *,
-    travel_mm: Sequence[float],
+    travel_mm: Sequence[tuple[float, float]],
     kinematics: str = "cartesian",
     fields: Sequence[str] = (),
 ) -> Machine:
@@ -162,8 +165,8 @@ def machine_from_m503(
         What the printer answered, and the name of the file it stands in.
     stated : StatedMachine
         Without resonances those of the firmware's shaper (M593) are used, else 50 Hz.
-    travel_mm : sequence of float
-        Travel of X, Y and Z from 0.
+    travel_mm : sequence of (float, float)
+        Where X, Y and Z begin and end.
     fields : sequence of str
         ``FIELD=VALUE`` of the firmware section that M503 does not say.
 
@@ -182,8 +185,8 @@ def machine_from_m503(
         "source": f"M503 in {file}",
         "kinematics": kinematics,
         "travel": {
-            axis: {"min_mm": 0.0, "max_mm": reach}
-            for axis, reach in zip("xyz", travel_mm, strict=True)
+            axis: {"min_mm": begin, "max_mm": end}
+            for axis, (begin, end) in zip("xyz", travel_mm, strict=True)
         },
         "firmware": section,
         "axes": {
@@ -259,14 +262,25 @@ def of_other_tools(text: str) -> list[str]:
     return found
 
 
-def read_travel(text: str) -> tuple[float, float, float]:
-    """Parse a travel such as ``235x235x250``, in mm."""
-    parts = re.split(r"[x,]", text.strip().lower())
+def read_travel(text: str) -> list[tuple[float, float]]:
+    """Parse where X, Y and Z begin and end, in mm: ``235x235x250``, or ``-4:220x-17:227x250``.
+
+    Raises
+    ------
+    ModelError
+        If it is not that.
+    """
+    ends = [part.split(":") for part in re.split(r"[x,]", text.strip().lower())]
     try:
-        x, y, z = map(float, parts)
+        pairs = [(float("0" if len(part) == 1 else part[0]), float(part[-1])) for part in ends]
     except ValueError:
-        raise ModelError(f"--travel {text!r}: give X, Y and Z in mm, like 235x235x250") from None
-    return x, y, z
+        pairs = []
+    if len(pairs) != 3 or max(map(len, ends)) > 2:
+        raise ModelError(
+            f"--travel {text!r}: give where X, Y and Z end in mm, like 235x235x250, or where each "
+            "begins and ends, like -4:220x-17:227x0:250"
+        )
+    return pairs
 
 
 def _set_fields(section: dict[str, Any], fields: Sequence[str]) -> None:

@@ -262,7 +262,7 @@ def ours(
         Where to begin, and after the last newline.
     state, words : float array
     wanted : uint8 array
-        The awaited line of the original without its newline; may be empty. Executed if plain.
+        The awaited line of the original without blanks at its end; may be empty. Executed if plain.
     rests : bool
         Compare the states before and after it with those of the original.
     before, after : float array
@@ -288,7 +288,10 @@ def ours(
             k = 0
             while k < length and text[at + k] == wanted[k]:
                 k += 1
-            is_wanted = k == length and (text[at + k] == 10 or text[at + k] == 13)
+            if k == length:
+                while text[at + k] == 32 or (9 <= text[at + k] <= 13 and text[at + k] != 10):
+                    k += 1
+                is_wanted = text[at + k] == 10
         next_at, mask = _words(text, at, words, False)
         if next_at < 0:
             break

@@ -45,6 +45,8 @@ def speed_step(
 ) -> float:
     """Return the largest speed step of a motor between moves, less what rounding may cause.
 
+    Ramps are no steps: the firmware keeps them to its acceleration, which is what motors bear.
+
     Parameters
     ----------
     accel_s ... direction
@@ -52,7 +54,7 @@ def speed_step(
     step_mm : float
         Possible error of a move's length; that of its speed is this over its duration.
     mean : bool
-        Use the mean speed of a move instead of its cruise speed.
+        Ramps are shorter than a motor's step: moves have their mean speed from begin to end.
     corexy : bool
         The motors turn with x + y and x - y.
     """
@@ -60,17 +62,17 @@ def speed_step(
     before_a = before_b = rounded_before = 0.0
     for k in range(len(cruise_s)):
         duration = accel_s[k] + cruise_s[k] + decel_s[k]
-        speed = cruise_mm_s[k]
+        begin, fallen = start_mm_s[k], accel_mm_s2[k] * decel_s[k]
+        end = cruise_mm_s[k] - fallen
         if mean:
-            lifted = accel_s[k] * (speed - start_mm_s[k])
-            fallen = accel_mm_s2[k] * decel_s[k] * decel_s[k]
-            speed -= 0.5 * (lifted + fallen) / max(duration, 1e-9)
-        a, b = direction[k, 0] * speed, direction[k, 1] * speed
+            lost = accel_s[k] * (cruise_mm_s[k] - begin) + fallen * decel_s[k]
+            begin = end = cruise_mm_s[k] - 0.5 * lost / max(duration, 1e-9)
+        a, b = direction[k, 0], direction[k, 1]
         rounded = step_mm / max(duration, 1e-4)
         if corexy:
             a, b, rounded = a + b, a - b, 2.0 * rounded
         if k > 0:
-            step = max(abs(a - before_a), abs(b - before_b))
+            step = max(abs(a * begin - before_a), abs(b * begin - before_b))
             worst = max(worst, step - rounded_before - rounded)
-        before_a, before_b, rounded_before = a, b, rounded
+        before_a, before_b, rounded_before = a * end, b * end, rounded
     return worst

@@ -53,8 +53,9 @@ class _Given:
         str,
         Query(
             max_length=60,
-            description="Travel of the axes in mm, which is not in M503's output.",
-            examples=["235x235x250"],
+            description="Travel of the axes in mm, which is not in M503's output: where each "
+            "ends, or begins and ends.",
+            examples=["235x235x250", "-4:220x-17:227x0:250"],
         ),
     ] = ""
     kinematics: Annotated[

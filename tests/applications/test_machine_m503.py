@@ -66,6 +66,28 @@ def stored(capsys: pytest.CaptureFixture[str]):
     return read_machine(capsys.readouterr().out.encode(), "mine")
 
 
+@pytest.mark.parametrize(
+    "line", ["echo:  M970 X1 Y0", "FIRMWARE_NAME:Prusa-Firmware-Buddy 6.2.4+8909 (Github)"]
+)
+def test_a_buddy_is_none_of_marlins_releases(make, capsys, line: str) -> None:
+    """Prusa's printers answer M503 as others do, and were taken for one that takes a stream."""
+    code, out, _ = make(f"{line}\n{M503}")
+    assert (code, stored(capsys).firmware.variant) == (0, "prusa")
+    assert "variant=2.1" not in out
+    assert "use method advise" in out
+
+
+def test_axes_that_begin_beside_the_bed(make, capsys) -> None:
+    """Start codes of Creality's printers draw a line at X-2.1 there."""
+    assert make(M503, "--travel=-4:220x-17:227x250")[0] == 0
+    travel = stored(capsys).travel
+    assert [(travel[a].min_mm, travel[a].max_mm) for a in ("x", "y", "z")] == [
+        (-4.0, 220.0),
+        (-17.0, 227.0),
+        (0.0, 250.0),
+    ]
+
+
 def test_what_other_tools_have_is_told(make) -> None:
     """The document has one value of each; what a stream restores is that."""
     _, out, _ = make(M503)
@@ -150,6 +172,7 @@ def test_fixed_time_motion_of_both_versions(
         (M503 + "echo:  M665 L215 R105.2 H330 S200\n", (), ("M665", "delta", "as sliced")),
         (M503.replace("M593 X F", "M593 X P4 F"), (), ("M593 X P", "J1", "as sliced")),
         (M503, ("--travel", "235"), ("--travel", "235x235x250")),
+        (M503, ("--travel", "0:1:235x235x250"), ("--travel", "-4:220")),
         (M503, ("--set", "s_curve"), ("FIELD=VALUE",)),
         (M503, ("--set", "s_curv=true"), ("s_curv",)),
         (M503, ("--kinematics", "delta"), ("kinematics", "delta")),

@@ -64,13 +64,12 @@ def test_a_vase_on_a_machine_with_a_slow_z() -> None:
     assert deviation(made, made.encoded.phases)[made.extruding].max() < 15e-3
 
 
-def test_a_fast_corexy_is_driven_more_gently_where_its_motors_would_step_too_far() -> None:
-    """20 m/s2 of X and of Y are 40 m/s2 for a motor, 40 mm/s in a segment of 1 ms."""
+def test_the_acceleration_of_a_fast_corexy_is_no_step_of_speed() -> None:
+    """As on printers with 20 to 40 m/s2, whose corners are slow: most of a print was put back."""
     ring = "G1 X60 Y84.6 E1.1\nG1 X35.4 Y60 E1.1\nG1 X60 Y35.4 E1.1\nG1 X84.6 Y60 E1.1\n"
-    text = f"{HEAD}SET_VELOCITY_LIMIT ACCEL=12000\nG1 X84.6 F24000\n{ring}"
-    bends_mm = []
+    text = f"{HEAD}SET_VELOCITY_LIMIT ACCEL=20000\nG1 X84.6 F24000\n{ring}"
     for step_mm_s in (100.0, 30.0):
-        command = CommandLimits(accel_mm_s2=20_000.0, speed_step_mm_s=step_mm_s)
+        command = CommandLimits(accel_mm_s2=60_000.0, speed_step_mm_s=step_mm_s)
         changes = {"kinematics": "corexy", "command": command}
         machine = load_machine("ender3").model_copy(update=changes)
         piece = pieces_of(text, machine)[-1]
@@ -78,12 +77,14 @@ def test_a_fast_corexy_is_driven_more_gently_where_its_motors_would_step_too_far
         work.compensator.reset(piece.phases.start_mm[0, :2])
         made = work.compensate(piece)
         phases = made.encoded.phases
-        speed = phases.direction[:, :2] * phases.cruise_mm_s[:, None]
-        motors = speed @ np.array([[1.0, 1.0], [1.0, -1.0]])
-        assert np.max(np.abs(np.diff(motors, axis=0))) <= step_mm_s
-        bends_mm.append(made.bend_mm)
-    assert bends_mm[1] <= bends_mm[0] <= 20.4e-3
-    assert bends_mm[1] <= 16e-3 * 1.001
+        motors = phases.direction[:, :2] @ np.array([[1.0, 1.0], [1.0, -1.0]])
+        begin, end, top = (
+            motors * speed[:, None]
+            for speed in (phases.start_mm_s, phases.end_mm_s, phases.cruise_mm_s)
+        )
+        assert np.max(np.abs(begin[1:] - end[:-1])) <= step_mm_s
+        assert np.max(np.abs(np.diff(top, axis=0))) > 30.0
+        assert deviation(made, phases)[made.extruding].max() < 22e-3
 
 
 def test_what_climbs_too_fast_is_told(tmp_path: Path, cache: Path) -> None:

@@ -29,12 +29,14 @@ def test_speed_step(n: int, mean: bool, corexy: bool) -> None:
     found = speed_step(accel, cruise, decel, start, top, rate, direction, 0.01, mean, corexy)
     duration = accel + cruise + decel
     lost = 0.5 * (accel * (top - start) + rate * decel**2) / duration
-    velocity = direction[:, :2] * (top - lost if mean else top)[:, None]
+    ends = top - lost if mean else np.stack([start, top - rate * decel])
+    velocity = direction[:, :2] * np.broadcast_to(ends, (2, n))[..., None]
     rounding = 0.01 / np.maximum(duration, 1e-4)
     if corexy:
         velocity = velocity @ np.array([[1.0, 1.0], [1.0, -1.0]])
         rounding = 2.0 * rounding
-    steps = np.abs(np.diff(velocity, axis=0)).max(axis=1) - rounding[1:] - rounding[:-1]
+    begin, end = velocity
+    steps = np.abs(begin[1:] - end[:-1]).max(axis=1) - rounding[1:] - rounding[:-1]
     assert found == pytest.approx(np.max(steps, initial=0.0), rel=1e-12)
 
 

@@ -7,7 +7,8 @@ import { problemPanel } from "../lib/problem.js";
 import { dropZone } from "../parts/drop-zone.js";
 import { NAME } from "./name.js";
 
-const TRAVEL = "\\s*[0-9.]+\\s*[xX]\\s*[0-9.]+\\s*[xX]\\s*[0-9.]+\\s*";
+const ENDS = "\\s*(-?[0-9.]+\\s*:\\s*)?[0-9.]+\\s*";
+const TRAVEL = `${ENDS}[xX]${ENDS}[xX]${ENDS}`;
 const M503 = /^.*\bM(92|201|203|204|205)\s+[A-Z]/m;
 
 /**
@@ -26,7 +27,7 @@ export function settingsPanel({ machine, signal }) {
   const [fx, fy] = ["x", "y"].map((axis) => h("input", { type: "number", id: `f${axis}`, min: "1", max: "500", step: "any", placeholder: "as the file says" }));
   const marlin = h("div", { hidden: true },
     h("div.fields", null,
-      field("travel", "How far X, Y and Z reach, mm", travel, "M503 does not say it."),
+      field("travel", "How far X, Y and Z reach, mm", travel, "M503 does not say it. Where an axis begins below 0, as start codes may want it: -4:220x-17:227x250."),
       field("kinematics", "Kinematics", kinematics)),
     h("p.hint", null, "What else M503 does not say (version, MIN_STEPS_PER_SEGMENT, S-curves) is taken as most builds have it. Look it up in Configuration.h, and change it in the machine's document if yours differs."));
   return h("form.card", { onsubmit: (/** @type {Event} */ event) => {

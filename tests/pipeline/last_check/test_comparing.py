@@ -285,6 +285,16 @@ def test_a_file_with_a_fault_is_not_delivered(
     assert target.read_bytes() == b"kept"
 
 
+BLANKS = """\
+G28
+M83
+G1 X60 Y145 Z0.28 F5000 ;to the side \t
+G1 X60 Y20 F1500 E12 ;a line\x20
+G1 Z2 F3000 ;Move Z up\x20
+G1 E-1 F1800 \t
+G1 X80 Y20 F6000
+G1 X80 Y60 E2
+"""
 RETRACTED = """\
 G28
 M82
@@ -490,6 +500,9 @@ LAYER_AGAIN = (
         pytest.param("marlin", SUBCODE, id="subcode"),
         # Nobody knows which speed it is afterwards.
         pytest.param("reprapfirmware", CONDITION, id="condition"),
+        # Profiles have blanks behind the comments of their start code.
+        pytest.param("klipper", BLANKS, id="blanks"),
+        pytest.param("marlin", BLANKS, id="blanks in Marlin"),
     ],
 )
 def test_what_files_of_chance_found(kind: str, text: str, tmp_path: Path, cache: Path) -> None:
