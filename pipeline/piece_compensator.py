@@ -29,7 +29,7 @@ from stillpath.models.schedule import EMPTY, OperatingPoint
 from stillpath.pipeline.caution import design_mode, set_or_nominal
 from stillpath.pipeline.filament import feed_evenly, retract_along
 from stillpath.pipeline.following import follow_tolerance_mm, strayed
-from stillpath.pipeline.measuring._peak_kernels import peaks, speed_step
+from stillpath.pipeline.measuring._peak_kernels import peaks, speed_steps
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.pipeline.options import COARSE_UM, Options
 from stillpath.pipeline.standing import Standing
@@ -262,6 +262,8 @@ class PieceCompensator:
     ) -> tuple[Segments, Encoded]:
         """Return segments and moves, finer where a motor's speed step would be too large."""
         limit = self._machine.command.speed_step_mm_s
+        # A fast machine's own acceleration changes its speed by more.
+        most = max(limit, 1e-3 * self._path_accel_mm_s2)
         tolerance = self._tolerance_mm
         # The command's own speed may change by more within a sample.
         step_mm_s = max(bend_mm / timeline.dt_s, _STEP_SHARE * limit)
@@ -284,13 +286,14 @@ class PieceCompensator:
             if len(encoded.row) == 0:
                 line = int(piece.moves.line[0])
                 raise Unfit(f"line {line}: all moves round to zero at the resolution of a file")
-            step = self._speed_step(encoded.phases)
-            if step <= limit:
+            step, change = self._speed_steps(encoded.phases)
+            if step <= limit and change <= most:
                 return segments, encoded
             tolerance *= 0.5
         raise _Sudden(
-            f"a motor's speed would step by {step:.0f} mm/s between two segments; the machine "
-            f"allows {limit:.0f} mm/s (command.speed_step_mm_s)"
+            f"a motor's speed would step by {step:.0f} mm/s between two segments, and change by "
+            f"{change:.0f} mm/s within a millisecond; the machine allows {limit:.0f} and "
+            f"{most:.0f} mm/s (command.speed_step_mm_s, accel_mm_s2)"
         )
 
     def _keep_inside(self, segments: Segments, grid_mm: float) -> None:
@@ -302,9 +305,15 @@ class PieceCompensator:
             high = np.floor(travel.max_mm / grid_mm + 1e-6) * grid_mm
             np.clip(segments.end_mm[i], low, high, out=segments.end_mm[i])
 
-    def _speed_step(self, phases: Phases) -> float:
-        """Return the largest step of a motor's speed, less what rounding to steps may cause."""
-        return speed_step(
+    @property
+    def _path_accel_mm_s2(self) -> float:
+        """Largest acceleration of a motor while the head accelerates along its path."""
+        corexy = self._machine.kinematics == "corexy"
+        return self._machine.command.accel_mm_s2 * (np.sqrt(2.0) if corexy else 1.0)
+
+    def _speed_steps(self, phases: Phases) -> tuple[float, float]:
+        """Return the largest step of a motor's speed, and its change within a millisecond."""
+        return speed_steps(
             phases.accel_s,
             phases.cruise_s,
             phases.decel_s,

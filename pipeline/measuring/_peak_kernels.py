@@ -7,7 +7,9 @@ import numpy as np
 from stillpath.models.arrays import Array
 from stillpath.models.jit import kernel
 
-__all__ = ["peaks", "speed_step"]
+__all__ = ["peaks", "speed_steps"]
+
+_HALF_S = 5e-4
 
 
 @kernel(allocates=False)
@@ -31,7 +33,7 @@ def peaks(command: Array) -> tuple[float, float]:
 
 
 @kernel(allocates=False)
-def speed_step(
+def speed_steps(
     accel_s: Array,
     cruise_s: Array,
     decel_s: Array,
@@ -42,10 +44,11 @@ def speed_step(
     step_mm: float,
     mean: bool,
     corexy: bool,
-) -> float:
-    """Return the largest speed step of a motor between moves, less what rounding may cause.
+) -> tuple[float, float]:
+    """Return how a motor's speed changes between moves: by steps, and within a millisecond.
 
-    Ramps are no steps: the firmware keeps them to its acceleration, which is what motors bear.
+    Less what rounding may cause. In the second, the ramps beside a step count, which the firmware
+    keeps to its acceleration.
 
     Parameters
     ----------
@@ -58,21 +61,28 @@ def speed_step(
     corexy : bool
         The motors turn with x + y and x - y.
     """
-    worst = 0.0
-    before_a = before_b = rounded_before = 0.0
+    step = change = 0.0
+    end_a = end_b = near_a = near_b = rounded_before = 0.0
     for k in range(len(cruise_s)):
         duration = accel_s[k] + cruise_s[k] + decel_s[k]
         begin, fallen = start_mm_s[k], accel_mm_s2[k] * decel_s[k]
         end = cruise_mm_s[k] - fallen
         if mean:
             lost = accel_s[k] * (cruise_mm_s[k] - begin) + fallen * decel_s[k]
-            begin = end = cruise_mm_s[k] - 0.5 * lost / max(duration, 1e-9)
+            begin = end = after = before = cruise_mm_s[k] - 0.5 * lost / max(duration, 1e-9)
+        else:
+            rate = accel_mm_s2[k]
+            # At most the cruise speed: what a move then loses again is not counted.
+            after = min(begin + rate * _HALF_S, cruise_mm_s[k])
+            before = min(end + rate * _HALF_S, cruise_mm_s[k])
         a, b = direction[k, 0], direction[k, 1]
         rounded = step_mm / max(duration, 1e-4)
         if corexy:
             a, b, rounded = a + b, a - b, 2.0 * rounded
         if k > 0:
-            step = max(abs(a * begin - before_a), abs(b * begin - before_b))
-            worst = max(worst, step - rounded_before - rounded)
-        before_a, before_b, rounded_before = a * end, b * end, rounded
-    return worst
+            less = rounded_before + rounded
+            step = max(step, abs(a * begin - end_a) - less, abs(b * begin - end_b) - less)
+            change = max(change, abs(a * after - near_a) - less, abs(b * after - near_b) - less)
+        end_a, end_b, near_a, near_b = a * end, b * end, a * before, b * before
+        rounded_before = rounded
+    return step, change

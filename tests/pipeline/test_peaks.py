@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stillpath.pipeline.measuring._maxima_kernels import above, ringing
-from stillpath.pipeline.measuring._peak_kernels import peaks, speed_step
+from stillpath.pipeline.measuring._peak_kernels import peaks, speed_steps
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 50])
@@ -21,23 +21,26 @@ def test_peaks(n: int) -> None:
 @pytest.mark.parametrize("corexy", [False, True])
 @pytest.mark.parametrize("mean", [False, True])
 @pytest.mark.parametrize("n", [0, 1, 2, 50])
-def test_speed_step(n: int, mean: bool, corexy: bool) -> None:
+def test_speed_steps(n: int, mean: bool, corexy: bool) -> None:
     rng = np.random.default_rng(n)
     accel, cruise, decel = rng.uniform(0.0, 0.01, size=(3, n))
     start, top = rng.uniform(0.0, 100.0, size=(2, n))
     rate, direction = rng.uniform(100.0, 3000.0, size=n), rng.normal(size=(n, 4))
-    found = speed_step(accel, cruise, decel, start, top, rate, direction, 0.01, mean, corexy)
+    found = speed_steps(accel, cruise, decel, start, top, rate, direction, 0.01, mean, corexy)
     duration = accel + cruise + decel
     lost = 0.5 * (accel * (top - start) + rate * decel**2) / duration
-    ends = top - lost if mean else np.stack([start, top - rate * decel])
-    velocity = direction[:, :2] * np.broadcast_to(ends, (2, n))[..., None]
+    ends = np.stack([start, top - rate * decel])
+    near = np.minimum(ends + 0.5e-3 * rate, top)
+    speeds = np.broadcast_to(top - lost, (4, n)) if mean else np.concatenate([ends, near])
+    velocity = direction[:, :2] * speeds[..., None]
     rounding = 0.01 / np.maximum(duration, 1e-4)
     if corexy:
         velocity = velocity @ np.array([[1.0, 1.0], [1.0, -1.0]])
         rounding = 2.0 * rounding
-    begin, end = velocity
-    steps = np.abs(begin[1:] - end[:-1]).max(axis=1) - rounding[1:] - rounding[:-1]
-    assert found == pytest.approx(np.max(steps, initial=0.0), rel=1e-12)
+    begin, end, after, before = velocity
+    for one, later, earlier in zip(found, (begin, after), (end, before), strict=True):
+        steps = np.abs(later[1:] - earlier[:-1]).max(axis=1) - rounding[1:] - rounding[:-1]
+        assert one == pytest.approx(np.max(steps, initial=0.0), rel=1e-12)
 
 
 @pytest.mark.parametrize("seed", range(20))
