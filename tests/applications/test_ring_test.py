@@ -157,7 +157,7 @@ def test_other_firmwares_have_ring_tests(
 def test_one_that_stays_as_planned_is_not_written(
     machine: Machine, cache: Path, tmp_path: Path
 ) -> None:
-    command = machine.command.model_copy(update={"accel_mm_s2": 3000.0, "speed_step_mm_s": 1.0})
+    command = machine.command.model_copy(update={"accel_mm_s2": 3000.0, "speed_step_mm_s": 0.1})
     weak = machine.model_copy(update={"command": command})
     with pytest.raises(ModelError, match=r"2 of the 2 parts .* would stay as planned"):
         write_ring_test(weak, tmp_path / "ring.gcode", cache_dir=cache)
