@@ -155,9 +155,10 @@ def direction_of(axis: str, *, allow_z: bool = False) -> tuple[float, float]:
         size = math.hypot(x, y)
         if size > 0 and not any(rest):
             return x / size, y / size
-    raise ModelError(
-        f"axis {axis!r} is not a direction of the plane; give x, y, or components like 1.000,1.000"
-    )
+    remedy = "give x, y, or components like 1.000,1.000"
+    if text == "z":
+        remedy = "only X and Y are compensated, so leave out tests along Z"
+    raise ModelError(f"axis {axis!r} is not a direction of the plane; {remedy}")
 
 
 def excitation_for(
