@@ -312,6 +312,7 @@ def check(
         check_before_job,
         envelope_warnings,
         not_followed,
+        read_as_today,
     )
     from stillpath.applications.machines.klipper_config import read_printer_config
 
@@ -326,6 +327,8 @@ def check(
     )
     found += _refused(machine)
     notes = envelope_warnings(machine) + ([] if config is None else not_followed(config))
+    if config is not None and any("minimum_cruise_ratio" in line for line in found):
+        notes += read_as_today(config)
     for line in [*found, *(f"note: {line}" for line in notes)]:
         typer.echo(line)
     if found:
@@ -349,7 +352,11 @@ def from_config(
     by: By = None,
 ) -> None:
     """Make a machine from a printer.cfg: limits and travel, with plants still to be measured."""
-    from stillpath.applications.machines.checks import machine_from_config, not_followed
+    from stillpath.applications.machines.checks import (
+        machine_from_config,
+        not_followed,
+        read_as_today,
+    )
     from stillpath.applications.machines.klipper_config import read_printer_config
     from stillpath.applications.machines.revision import source_file
 
@@ -364,7 +371,7 @@ def from_config(
         expected=0,
     )
     print_revision(revision)
-    for line in not_followed(config):
+    for line in [*not_followed(config), *read_as_today(config)]:
         typer.echo(f"note: {line}")
 
 

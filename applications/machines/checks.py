@@ -27,6 +27,7 @@ __all__ = [
     "envelope_warnings",
     "machine_from_config",
     "not_followed",
+    "read_as_today",
     "stated_axis",
     "with_firmware",
 ]
@@ -250,6 +251,30 @@ def not_followed(config: PrinterConfig) -> list[str]:
         f"[include {name}] in {config.name}: not followed; its contents were not checked"
         for name in config.includes
     ]
+
+
+def read_as_today(config: PrinterConfig) -> list[str]:
+    """Return a warning where an older Klipper understands an option in another way.
+
+    Until 2024-03 max_accel_to_decel was a limit of its own, whatever ACCEL a file sets
+    (klippy/toolhead.py).
+    """
+    section, option = "printer", "max_accel_to_decel"
+    if config.text(section, option) is None or config.text(section, "minimum_cruise_ratio"):
+        return []
+    limit, most = config.number(section, option), config.positive(section, "max_accel")
+    if limit >= most:
+        return []
+    half = 0.5 * most
+    note = (
+        f"[printer] max_accel_to_decel {limit:g}: taken as minimum_cruise_ratio "
+        f"{1.0 - limit / most:g}, as Klipper since 2024-03 does. An older one, as most vendors' "
+        f"is, keeps {limit:g} whatever ACCEL a file sets, and makes short moves faster: if yours "
+        f"is one, put 1 - {limit:g}/ACCEL of your files at firmware.planner.minimum_cruise_ratio "
+        f"({max(0.0, 1.0 - limit / half):g} for ACCEL={half:g}), or prints take longer than as "
+        "sliced"
+    )
+    return [note]
 
 
 def stated_axis(f_hz: float, zeta: float) -> dict[str, Any]:

@@ -90,20 +90,7 @@ def firmware_section(text: str, name: str) -> dict[str, Any]:
     if re.search(r"(?m)^(?:.*:)?\s*G20\b", text):
         raise ModelError(f"{name}: the printer works in inches; send G21, then M503 again")
     found = _commands(text)
-    if "M665" in found:
-        # Printed by builds with DELTA, SCARA or POLAR alone (calibrate/M665.cpp, 2.1.x, 2024).
-        raise ModelError(
-            f"{name}: M665 says that the printer is a delta, or another one whose motors are not X "
-            "and Y; only cartesian and corexy are compensated: print on it as sliced"
-        )
-
-    if "P" in found.get("M593 X", {}):
-        # Snapmaker's for the J1 (SnapmakerController-IDEX, AxisManager.cpp, 2024-08): M593 F0 is an
-        # error there, as in no other Marlin with this word.
-        raise ModelError(
-            f"{name}: M593 X P.. says that this is the Marlin of Snapmaker's J1, whose shaper F0 "
-            "does not switch off: it would act on top of the compensation. Print on it as sliced"
-        )
+    _check_printer(found, name)
 
     def word(command: str, letter: str, default: float | None = None) -> float:
         value = found.get(command, {}).get(letter)
@@ -127,14 +114,7 @@ def firmware_section(text: str, name: str) -> dict[str, Any]:
             else {"jerk_mm_s": per_axis("M205")}
         ),
     }
-    section: dict[str, Any] = {}
-    if "M970" in found or "Prusa-Firmware-Buddy" in text:
-        # Phase stepping, which only that firmware has (configuration_store.cpp, 2025-04), or M115.
-        section["variant"] = "prusa"
-    if "M493" in found:
-        # Version 1 reports Y's frequency as B, version 2 one line for each axis.
-        section["ft_motion_version"] = 1 if "B" in found["M493"] else 2
-    return section | {
+    return _versions(found, text) | {
         "kind": "marlin",
         "steps_per_mm": per_axis("M92"),
         "planner": planner,
@@ -146,6 +126,35 @@ def firmware_section(text: str, name: str) -> dict[str, Any]:
         "ft_motion": word("M493", "S", 0.0) > 0.0,
         "retraction": _retraction(found, word),
     }
+
+
+def _check_printer(found: dict[str, _Words], name: str) -> None:
+    """Refuse printers that cannot execute a stream; `name` is the file's."""
+    if "M665" in found:
+        # Printed by builds with DELTA, SCARA or POLAR alone (calibrate/M665.cpp, 2.1.x, 2024).
+        raise ModelError(
+            f"{name}: M665 says that the printer is a delta, or another one whose motors are not X "
+            "and Y; only cartesian and corexy are compensated: print on it as sliced"
+        )
+    if "P" in found.get("M593 X", {}):
+        # Snapmaker's for the J1 (SnapmakerController-IDEX, AxisManager.cpp, 2024-08): M593 F0 is an
+        # error there, as in no other Marlin with this word.
+        raise ModelError(
+            f"{name}: M593 X P.. says that this is the Marlin of Snapmaker's J1, whose shaper F0 "
+            "does not switch off: it would act on top of the compensation. Print on it as sliced"
+        )
+
+
+def _versions(found: dict[str, _Words], text: str) -> dict[str, Any]:
+    """Return what an answer tells of the firmware's version."""
+    section: dict[str, Any] = {}
+    if "M970" in found or "Prusa-Firmware-Buddy" in text:
+        # Phase stepping, which only that firmware has (configuration_store.cpp, 2025-04), or M115.
+        section["variant"] = "prusa"
+    if "M493" in found:
+        # Version 1 reports Y's frequency as B, version 2 one line for each axis.
+        section["ft_motion_version"] = 1 if "B" in found["M493"] else 2
+    return section
 
 
 def machine_from_m503(

@@ -353,6 +353,26 @@ def test_a_fork_that_keeps_its_shaper_elsewhere(store: MachineStore, config: Pat
     assert "u1" not in store.names()
 
 
+@pytest.mark.parametrize(
+    ("more", "told"),
+    [
+        ("max_accel_to_decel: 1000", "(0.5 for ACCEL=2000)"),
+        ("max_accel_to_decel: 4000", ""),
+        ("max_accel_to_decel: 1000\nminimum_cruise_ratio: 0.75", ""),
+        ("", ""),
+    ],
+)
+def test_an_option_that_older_klippers_understand_otherwise(
+    store: MachineStore, config: Path, capsys, more: str, told: str
+):
+    """Vendors' printers have it and such a Klipper; prints took up to an eighth longer."""
+    config.write_text(CONFIG.replace("max_accel = 4000", f"max_accel = 4000\n{more}"))
+    assert machines("from-config", config, "--name", "mine") == 0
+    notes = [line for line in capsys.readouterr().out.splitlines() if "to_decel" in line]
+    assert len(notes) == bool(told)
+    assert told in "".join(notes)
+
+
 def test_limits_by_axis_of_a_fork_are_told_apart(store: MachineStore, config: Path, capsys):
     by_axis = "kinematics: limited_corexy\nmax_x_accel: 8000\nmax_y_accel: 3000"
     config.write_text(CONFIG.replace("kinematics: corexy", by_axis))
