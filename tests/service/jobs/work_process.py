@@ -27,6 +27,8 @@ if __name__ == "__main__":
         signal.signal(number, lambda *_: ended.set())
     work.start()
     print("working", flush=True)
-    ended.wait()
+    # In turns: a signal that another thread receives does not wake one that waits without end.
+    while not ended.wait(1.0):
+        pass
     work.stop()
     engine.dispose()
