@@ -365,7 +365,7 @@ def test_a_fork_that_keeps_its_shaper_elsewhere(store: MachineStore, config: Pat
 def test_an_option_that_older_klippers_understand_otherwise(
     store: MachineStore, config: Path, capsys, more: str, told: str
 ):
-    """Vendors' printers have it and such a Klipper; prints took up to an eighth longer."""
+    """Vendors' printers have it and such a Klipper; prints took longer than as sliced."""
     config.write_text(CONFIG.replace("max_accel = 4000", f"max_accel = 4000\n{more}"))
     assert machines("from-config", config, "--name", "mine") == 0
     notes = [line for line in capsys.readouterr().out.splitlines() if "to_decel" in line]
