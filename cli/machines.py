@@ -312,7 +312,7 @@ def check(
         check_before_job,
         envelope_warnings,
         not_followed,
-        read_as_today,
+        read_as_older,
     )
     from stillpath.applications.machines.klipper_config import read_printer_config
 
@@ -328,7 +328,7 @@ def check(
     found += _refused(machine)
     notes = envelope_warnings(machine) + ([] if config is None else not_followed(config))
     if config is not None and any("minimum_cruise_ratio" in line for line in found):
-        notes += read_as_today(config)
+        notes += read_as_older(config)
     for line in [*found, *(f"note: {line}" for line in notes)]:
         typer.echo(line)
     if found:
@@ -355,7 +355,7 @@ def from_config(
     from stillpath.applications.machines.checks import (
         machine_from_config,
         not_followed,
-        read_as_today,
+        read_as_older,
     )
     from stillpath.applications.machines.klipper_config import read_printer_config
     from stillpath.applications.machines.revision import source_file
@@ -371,7 +371,7 @@ def from_config(
         expected=0,
     )
     print_revision(revision)
-    for line in [*not_followed(config), *read_as_today(config)]:
+    for line in [*not_followed(config), *read_as_older(config)]:
         typer.echo(f"note: {line}")
 
 

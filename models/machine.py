@@ -214,6 +214,8 @@ class Machine(Document):
             del content["firmware"]["ft_motion"]
         if not content["firmware"].get("macros", True):
             del content["firmware"]["macros"]
+        if content["firmware"].get("planner", {}).get("max_accel_to_decel_mm_s2", ...) is None:
+            del content["firmware"]["planner"]["max_accel_to_decel_mm_s2"]
         for added in ("arc_circles", "limits_capped"):
             if not content["firmware"].get(added, True):
                 del content["firmware"][added]

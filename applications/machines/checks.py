@@ -27,7 +27,7 @@ __all__ = [
     "envelope_warnings",
     "machine_from_config",
     "not_followed",
-    "read_as_today",
+    "read_as_older",
     "stated_axis",
     "with_firmware",
 ]
@@ -253,26 +253,21 @@ def not_followed(config: PrinterConfig) -> list[str]:
     ]
 
 
-def read_as_today(config: PrinterConfig) -> list[str]:
-    """Return a warning where an older Klipper understands an option in another way.
+def read_as_older(config: PrinterConfig) -> list[str]:
+    """Return a note where Klippers of two ages understand an option in two ways.
 
-    Until 2024-03 max_accel_to_decel was a limit of its own, whatever ACCEL a file sets
-    (klippy/toolhead.py).
+    Until 2024-03 max_accel_to_decel was a limit of its own, whatever ACCEL a file sets, then its
+    ratio to max_accel; since 2025-08 it is refused (klippy/toolhead.py).
     """
     section, option = "printer", "max_accel_to_decel"
     if config.text(section, option) is None or config.text(section, "minimum_cruise_ratio"):
         return []
-    limit, most = config.number(section, option), config.positive(section, "max_accel")
-    if limit >= most:
-        return []
-    half = 0.5 * most
+    limit = config.number(section, option)
     note = (
-        f"[printer] max_accel_to_decel {limit:g}: taken as minimum_cruise_ratio "
-        f"{1.0 - limit / most:g}, as Klipper since 2024-03 does. An older one, as most vendors' "
-        f"is, keeps {limit:g} whatever ACCEL a file sets, and makes short moves faster: if yours "
-        f"is one, put 1 - {limit:g}/ACCEL of your files at firmware.planner.minimum_cruise_ratio "
-        f"({max(0.0, 1.0 - limit / half):g} for ACCEL={half:g}), or prints take longer than as "
-        "sliced"
+        f"[printer] max_accel_to_decel {limit:g}: read as Klipper before 2024-03 does, as most "
+        f"vendors' is, which keeps {limit:g} whatever ACCEL a file sets. If yours is from 2024-03 "
+        "to 2025-08, write minimum_cruise_ratio into printer.cfg instead, or short moves will be "
+        "faster than as sliced"
     )
     return [note]
 

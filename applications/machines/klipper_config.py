@@ -202,20 +202,22 @@ def _printer(config: PrinterConfig) -> list[Fact]:
         return []
     velocity = config.number(section, "max_velocity")
     accel = config.number(section, "max_accel")
-    ratio, option = 0.5, "minimum_cruise_ratio"
+    ratio, option, to_decel = 0.5, "minimum_cruise_ratio", 0.0
     if config.text(section, option) is None and config.text(section, "max_accel_to_decel"):
+        # What it meant from 2024-03 until it was refused (2025-08): a ratio.
         option = "max_accel_to_decel"
-        ratio = 1.0 - min(
-            1.0, config.number(section, option) / config.positive(section, "max_accel")
-        )
+        to_decel = config.positive(section, option)
+        ratio = 1.0 - min(1.0, to_decel / config.positive(section, "max_accel"))
     else:
         ratio = config.number(section, option, ratio)
     planner, options = "firmware.planner", config.sections[section]
+    older = f"{planner}.max_accel_to_decel_mm_s2"
     return [
         Fact(section, "kinematics", "kinematics", config.text(section, "kinematics")),
         Fact(section, "max_velocity", f"{planner}.max_velocity_mm_s", velocity),
         Fact(section, "max_accel", f"{planner}.max_accel_mm_s2", accel),
         Fact(section, option, f"{planner}.minimum_cruise_ratio", ratio),
+        *([Fact(section, option, older, to_decel)] if to_decel else []),
         *_numbers(
             config,
             section,

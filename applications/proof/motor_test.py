@@ -208,6 +208,7 @@ def _own(firmware: Klipper) -> KlipperLimits:
         planner.max_accel_mm_s2,
         planner.square_corner_velocity_mm_s,
         planner.minimum_cruise_ratio,
+        planner.max_accel_to_decel_mm_s2 or 0.0,
     )
 
 

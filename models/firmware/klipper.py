@@ -47,6 +47,9 @@ class PlannerLimits(Document):
     max_accel_mm_s2: Positive = 5000.0
     square_corner_velocity_mm_s: NonNegative = 5.0
     minimum_cruise_ratio: Annotated[float, Field(ge=0, lt=1)] = 0.5
+    max_accel_to_decel_mm_s2: Positive | None = None
+    """Of a Klipper before 2024-03, as most vendors' are: it takes the place of the ratio, and an
+    acceleration that a file sets leaves it as it is. None: a newer one."""
     max_z_velocity_mm_s: Positive = 20.0
     max_z_accel_mm_s2: Positive = 200.0
 

@@ -14,6 +14,7 @@ from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.types import KEPT, EventKind, ProgramBlock
 from stillpath.models.firmware import FirmwareFacts, Klipper, Marlin, RepRapFirmware
+from stillpath.models.firmware.klipper import PlannerLimits
 from stillpath.models.machine import Machine
 
 HOMED = {"homed_at_start": True, "home_mm": (0.0, 0.0, 0.0)}
@@ -45,7 +46,7 @@ LARGE = ("marlin", "marlin-2.0", "bambu")  # with all options built in
 
 @pytest.fixture
 def read(golden_machine: Machine):
-    def reader(text: str, name: str, **facts: str) -> tuple[ProgramBlock, Interpreter]:
+    def reader(text: str, name: str, **facts: object) -> tuple[ProgramBlock, Interpreter]:
         firmware = FIRMWARES[name].model_copy(update=facts)
         machine = golden_machine.model_copy(update={"firmware": firmware})
         interpreter = Interpreter(machine, strict_bounds=False)
@@ -623,6 +624,8 @@ def test_a_limit_of_older_klippers_is_told_once(read) -> None:
     assert said.startswith("line 2: ACCEL_TO_DECEL is not followed")
     # Lines for old and new Klippers, such as a stream's.
     assert read(f"{line} MINIMUM_CRUISE_RATIO=.5\n", "klipper")[1].warnings == []
+    older = PlannerLimits(max_accel_to_decel_mm_s2=2000.0)
+    assert read(f"{line}\n", "klipper", planner=older)[1].warnings == []
 
 
 @pytest.mark.parametrize(

@@ -257,4 +257,4 @@ def test_stream_limits_are_the_machines(machine: Machine) -> None:
     diagonal = pytest.approx(2**0.5 * machine.command.velocity_mm_s)
     # 27 mm/s at a small angle, of the 45 that a motor's speed may step by within a ms.
     corner = pytest.approx(27.0 / 1.8203, abs=0.01)
-    assert stream.as_row() == (diagonal, 20_000.0, corner, 0.0)
+    assert stream.as_row() == (diagonal, 20_000.0, corner, 0.0, 0.0)

@@ -19,8 +19,10 @@ def test_limits_of_moves() -> None:
     travel[::17, :3] = 0.0
     travel[::17, 3] = rng.normal(0.0, 1.0, len(travel[::17]))
     start = np.cumsum(travel, axis=0) - travel
-    limits = np.array([[500.0, 3e5, 500.0, 0.0], [80.0, 3000.0, 5.0, 0.5]])
-    which = rng.integers(0, 2, n).astype(np.int32)
+    limits = np.array(
+        [[500.0, 3e5, 500.0, 0.0, 0.0], [80.0, 3000.0, 5.0, 0.5, 0.0], [80.0, 3e3, 5.0, 0.5, 1e3]]
+    )
+    which = rng.integers(0, 3, n).astype(np.int32)
     allowed, stops = MoveLimits(*np.empty((4, n))), np.empty(n, bool)
     move_limits(start, start + travel, which, limits, FACTS, allowed, stops)
     length, accel, speed, junction = allowed
@@ -39,7 +41,10 @@ def test_limits_of_moves() -> None:
         given = np.where(stops, np.inf, limits[which, 1])
         most = np.minimum.reduce([given, z_accel / climb, e_accel / pull])
         given = np.where(stops, np.inf, limits[which, 0])
-        smooth = np.minimum(limits[which, 1] * (1.0 - limits[which, 3]), most)
+        smooth = np.where(
+            limits[which, 4] > 0.0, limits[which, 4], limits[which, 1] * (1.0 - limits[which, 3])
+        )
+        smooth = np.minimum(smooth, most)
         peak = np.where(stops, np.sqrt(path * smooth), np.inf)
         fastest = np.minimum.reduce([given, z_speed / climb, e_speed / pull, peak])
         by_filament = e_corner / np.abs(np.diff(ratio))

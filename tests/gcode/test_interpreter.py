@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from stillpath.gcode.errors import GcodeError
+from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.types import EventKind, ProgramBlock
 from stillpath.models.machine import Machine
@@ -86,6 +87,27 @@ def test_limits(golden_machine: Machine) -> None:
     assert after[-1].velocity_mm_s == 250
     assert after[-1].square_corner_velocity_mm_s == 8
     assert after[-1].minimum_cruise_ratio == 0
+
+
+def test_limits_of_klipper_before_the_cruise_ratio(golden_machine: Machine) -> None:
+    """Its max_accel_to_decel does not follow ACCEL, and what we write back is for both ages."""
+    firmware = golden_machine.firmware
+    assert firmware.kind == "klipper"
+    planner = firmware.planner.model_copy(update={"max_accel_to_decel_mm_s2": 2500.0})
+    firmware = firmware.model_copy(update={"planner": planner})
+    machine = golden_machine.model_copy(update={"firmware": firmware})
+    block = run(
+        "M204 S1000\nSET_VELOCITY_LIMIT ACCEL=4000 ACCEL_TO_DECEL=2000\n"
+        "SET_VELOCITY_LIMIT ACCEL=3000 MINIMUM_CRUISE_RATIO=0\n",
+        machine,
+    )
+    after = [block.limits[k] for k in block.events.limits_id]
+    assert [limit.accel_to_decel_mm_s2 for limit in after] == [2500, 2000, 2000]
+    ratio = planner.minimum_cruise_ratio
+    assert [limit.minimum_cruise_ratio for limit in after] == [ratio] * 3
+    back = adapter(machine).stream_commands().limits(after[-1]).decode()
+    assert " ACCEL=3000 ACCEL_TO_DECEL=2000 " in back
+    assert back.endswith(f"MINIMUM_CRUISE_RATIO={ratio:g}\n")
 
 
 def test_limits_that_a_firmware_caps(golden_machine: Machine) -> None:

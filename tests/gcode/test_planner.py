@@ -20,7 +20,12 @@ from stillpath.models.machine import Machine
 from tests.gcode.cutting import blocks_of
 
 FIRMWARE = Klipper()
-LIMITS = [KlipperLimits(500.0, 5000.0, 5.0, 0.5), KlipperLimits(80.0, 1000.0, 8.0, 0.0)]
+LIMITS = [
+    KlipperLimits(500.0, 5000.0, 5.0, 0.5),
+    KlipperLimits(80.0, 1000.0, 8.0, 0.0),
+    KlipperLimits(400.0, 3000.0, 5.0, 0.5, 1000.0),
+    KlipperLimits(400.0, 500.0, 5.0, 0.5, 1000.0),
+]
 
 
 def moves_of(
@@ -135,6 +140,8 @@ def twin(
         r = step * (1.0 / path) if kinematic else np.array([0, 0, 0, np.sign(step[3])])
         v, a = (min(speed, limit.velocity_mm_s), limit.accel_mm_s2) if kinematic else (speed, 1e8)
         smooth = limit.accel_mm_s2 * (1 - limit.minimum_cruise_ratio)
+        if limit.accel_to_decel_mm_s2:
+            smooth = min(limit.accel_mm_s2, limit.accel_to_decel_mm_s2)
         if kinematic and r[2]:
             v = min(v, planner.max_z_velocity_mm_s / abs(r[2]))
             a = min(a, planner.max_z_accel_mm_s2 / abs(r[2]))
@@ -202,7 +209,7 @@ def streams(draw: st.DrawFn) -> Moves:
     steps = draw(st.lists(STEP, min_size=1, max_size=40))
     n = len(steps)
     speed = draw(st.lists(st.sampled_from([3.0, 25.0, 60.0, 180.0, 700.0]), min_size=n, max_size=n))
-    limits_id = draw(st.lists(st.integers(0, 1), min_size=n, max_size=n))
+    limits_id = draw(st.lists(st.integers(0, 3), min_size=n, max_size=n))
     return moves_of(np.array(steps), np.array(speed), np.array(limits_id))
 
 

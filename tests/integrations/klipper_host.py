@@ -222,11 +222,14 @@ def printer_cfg(machine: Machine, *more: str, shaper: bool = False) -> str:
     firmware = machine.firmware
     assert firmware.kind == "klipper"
     planner, hot = firmware.planner, firmware.extruder
+    to_decel = planner.max_accel_to_decel_mm_s2 or planner.max_accel_mm_s2 * (
+        1 - planner.minimum_cruise_ratio
+    )
     lines = [
         "[mcu]\nserial: /dev/none\nmax_stepper_error: 0.000001",
         f"[printer]\nkinematics: {machine.kinematics}\nmax_velocity: {planner.max_velocity_mm_s}",
         f"max_accel: {planner.max_accel_mm_s2}",
-        f"max_accel_to_decel: {planner.max_accel_mm_s2 * (1 - planner.minimum_cruise_ratio)}",
+        f"max_accel_to_decel: {to_decel}",
         f"square_corner_velocity: {planner.square_corner_velocity_mm_s}",
         f"max_z_velocity: {planner.max_z_velocity_mm_s}\nmax_z_accel: {planner.max_z_accel_mm_s2}",
     ]

@@ -100,13 +100,11 @@ class Difference:
 
 
 def of_the_package(machine: Machine) -> Machine:
-    """The machine without a minimum cruise ratio.
-
-    The package's Klipper of 2023 has max_accel_to_decel instead, which M204 does not scale.
-    """
+    """The machine with the limit that the package's Klipper of 2023 has in place of the ratio."""
     firmware = machine.firmware
     assert firmware.kind == "klipper"
-    planner = firmware.planner.model_copy(update={"minimum_cruise_ratio": 0.0})
+    older = {"max_accel_to_decel_mm_s2": 0.5 * firmware.planner.max_accel_mm_s2}
+    planner = firmware.planner.model_copy(update=older)
     return machine.model_copy(update={"firmware": firmware.model_copy(update={"planner": planner})})
 
 

@@ -128,6 +128,26 @@ def test_the_host_stands_for_the_smooth_time_of_pressure_advance(tmp_path: Path)
     assert max(found.largest.values()) < 1e-6
 
 
+def test_the_host_of_before_the_cruise_ratio(tmp_path: Path) -> None:
+    """Its max_accel_to_decel stays as it is where a file sets ACCEL, and follows ACCEL_TO_DECEL."""
+    machine = of_the_package(homed(load_machine("ender3")))
+    text = "G28\nG90\nM83\nG1 X10 Y10 Z5 F12000\n"
+    changes = (
+        "M204 S600",
+        "SET_VELOCITY_LIMIT ACCEL=2000 MINIMUM_CRUISE_RATIO=0.9",
+        "SET_VELOCITY_LIMIT ACCEL=4000 ACCEL_TO_DECEL=900",
+        "SET_VELOCITY_LIMIT ACCEL_TO_DECEL=9000",
+    )
+    for k, change in enumerate(changes):
+        text += f"{change}\n" + "".join(
+            f"G1 X{20 + 20 * k + step} Y{20 + step % 3} E.1\n" for step in range(20)
+        )
+    run(text, machine, tmp_path)
+    assert max(compared(text, machine, recorded(tmp_path)).largest.values()) < 1e-6
+    newer = homed(load_machine("ender3"))
+    assert compared(text, newer, recorded(tmp_path)).largest["cruise speed"] > 0.05
+
+
 @pytest.mark.parametrize("line", ["M119", "QUERY_ENDSTOPS"])
 def test_the_host_brakes_to_ask_the_endstops(line: str, tmp_path: Path) -> None:
     machine = of_the_package(homed(load_machine("ender3")))

@@ -28,8 +28,9 @@ def move_limits(
     Parameters
     ----------
     start, end : ndarray, shape (n, 4)
-    limits : ndarray, shape (m, 4)
-        Velocity, acceleration, square corner velocity and minimum cruise ratio of a `limits_id`.
+    limits : ndarray, shape (m, 5)
+        Velocity, acceleration, square corner velocity, minimum cruise ratio and the acceleration
+        that older ones have in its place (0: none) of a `limits_id`.
     facts : tuple of float
         Speed and acceleration of Z, of the extruder alone, and its instantaneous corner velocity.
     allowed : MoveLimits
@@ -62,7 +63,8 @@ def move_limits(
             velocity = min(velocity, e_speed / abs(ratio))
         if stops[i]:
             # From rest to rest; the minimum cruise ratio caps the peak as a gentler acceleration.
-            velocity = min(velocity, sqrt(path * min(own[1] * (1.0 - own[3]), most)))
+            smooth = min(own[1], own[4]) if own[4] > 0.0 else own[1] * (1.0 - own[3])
+            velocity = min(velocity, sqrt(path * min(smooth, most)))
         accel[i], speed[i] = most, velocity
         # The deviation follows from the limits, the acceleration from the move: Z's is lower.
         corner *= sqrt(most / own[1])

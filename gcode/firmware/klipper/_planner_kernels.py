@@ -85,6 +85,8 @@ def append(
         if not (cruise > 0.0 and accel > 0.0):
             return count, BAD_SPEED, m
         smooth_accel = limit[1] * (1.0 - limit[3])
+        if limit[4] > 0.0:
+            smooth_accel = min(limit[1], limit[4])
         if dz != 0.0:
             cruise = min(cruise, facts[C_Z_SPEED] * path / abs(dz))
             accel = min(accel, facts[C_Z_ACCEL] * path / abs(dz))

@@ -68,6 +68,7 @@ class KlipperAdapter:
             accel_mm_s2=planner.max_accel_mm_s2,
             square_corner_velocity_mm_s=planner.square_corner_velocity_mm_s,
             minimum_cruise_ratio=planner.minimum_cruise_ratio,
+            accel_to_decel_mm_s2=planner.max_accel_to_decel_mm_s2 or 0.0,
         )
 
     def stream_limits(self, own: Limits) -> KlipperLimits:  # noqa: ARG002
@@ -88,6 +89,7 @@ class KlipperAdapter:
             velocity_mm_s=scaled(mine.velocity_mm_s, speed, fastest),
             accel_mm_s2=raised,
             square_corner_velocity_mm_s=corner,
+            accel_to_decel_mm_s2=raised / mine.accel_mm_s2 * mine.accel_to_decel_mm_s2,
         )
 
     def planner(self, *, rests_apart: bool = False) -> Planner:  # noqa: ARG002

@@ -38,6 +38,7 @@ _LIMITS: dict[str, tuple[str, Callable[[float], bool], str]] = {
         lambda v: 0.0 <= v < 1.0,
         "at least 0 and below 1",
     ),
+    "ACCEL_TO_DECEL": ("accel_to_decel_mm_s2", lambda v: v > 0.0, "above 0"),
 }
 """Parameters of SET_VELOCITY_LIMIT: what they set, which values are allowed, and that in words."""
 _CAPPED = ("velocity_mm_s", "accel_mm_s2")
@@ -47,20 +48,23 @@ _MOST_STATES = 1000
 def velocity_limit(state: MachineState, command: Command, *, capped: bool = False) -> int:
     """SET_VELOCITY_LIMIT; `capped`: up to the speed and acceleration of printer.cfg."""
     given = state.extended(command)
+    # Before 2024-03 there was ACCEL_TO_DECEL and no ratio (klippy/toolhead.py).
+    old = dict(zip(state.limits_names, state.initial_limits, strict=True))["accel_to_decel_mm_s2"]
+    passed_over = "MINIMUM_CRUISE_RATIO" if old else "ACCEL_TO_DECEL"
     values = {}
     for key, (field, allows, allowed) in _LIMITS.items():
-        if key in given:
+        if key in given and key != passed_over:
             values[field] = state.number(given[key], key, command)
             if not allows(values[field]):
                 raise state.problem(f"{key}={given[key]} must be {allowed}", command)
-    if "ACCEL_TO_DECEL" in given and "MINIMUM_CRUISE_RATIO" not in given:
+    if "ACCEL_TO_DECEL" in given and not old and "MINIMUM_CRUISE_RATIO" not in given:
         state.warn(
             "ACCEL_TO_DECEL is not followed (Klipper ignores it since 2025-08-11): on an older one "
-            "short moves have other speeds; let the slicer write MINIMUM_CRUISE_RATIO, or update "
-            "Klipper"
+            "short moves have other speeds; if yours is from before 2024-03, put its "
+            "max_accel_to_decel at firmware.planner.max_accel_to_decel_mm_s2 of the machine"
         )
     # Kalico has further ones, of Z; held back in a stream they would be lost.
-    further = given.keys() - {*_LIMITS, "ACCEL_TO_DECEL"}
+    further = given.keys() - _LIMITS.keys()
     kind = EventKind.STATE if further else EventKind.LIMITS
     return state.set_limits(command, _held(state, values) if capped else values, kind=kind)
 

@@ -17,3 +17,5 @@ class KlipperLimits(Limits):
     accel_mm_s2: float
     square_corner_velocity_mm_s: float
     minimum_cruise_ratio: float
+    accel_to_decel_mm_s2: float = 0.0
+    """Above 0: the limit of a Klipper before 2024-03, in place of the ratio."""

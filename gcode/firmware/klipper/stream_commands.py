@@ -91,8 +91,8 @@ class KlipperStreamCommands:
     def limits(self, limits: Limits) -> bytes:
         """Return the line that sets the planner's limits."""
         own = cast(KlipperLimits, limits)
-        # ACCEL_TO_DECEL is what Klipper before 2024-03 reads instead of MINIMUM_CRUISE_RATIO.
-        to_decel = own.accel_mm_s2 * (1.0 - own.minimum_cruise_ratio)
+        # Klipper before 2024-03 reads ACCEL_TO_DECEL, a newer one MINIMUM_CRUISE_RATIO.
+        to_decel = own.accel_to_decel_mm_s2 or own.accel_mm_s2 * (1.0 - own.minimum_cruise_ratio)
         return (
             f"SET_VELOCITY_LIMIT VELOCITY={own.velocity_mm_s:.10g} ACCEL={own.accel_mm_s2:.10g} "
             f"ACCEL_TO_DECEL={to_decel:.10g} "
