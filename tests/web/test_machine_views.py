@@ -71,7 +71,11 @@ def test_a_measurement_is_tried_then_kept(visitor: Visitor, service: Service, tm
     expect(page.get_by_label("To, Hz")).to_have_attribute("placeholder", "135 (133.3)")
     for name, value in QUICK_QUERY.items():
         page.locator(f"#test-{name}").fill(str(value))
-    page.get_by_role("button", name="Look at the fit").click()
+    page.get_by_label("The frame does not move").check()
+    with page.expect_request("**/measurements?*") as sent:
+        page.get_by_role("button", name="Look at the fit").click()
+    assert "frame_firm=true" in sent.value.url
+    assert "sensor_turned" not in sent.value.url
     expect(page.get_by_role("heading", name="The fit")).to_be_focused()
     modes = page.get_by_role("region", name="Modes of the X axis").last
     expect(modes).to_contain_text(re.compile(r"4[12]\.\d\d ± 0\.\d\d"))

@@ -13,6 +13,10 @@ const TEST = [
   ["min_freq", "From, Hz", "5"], ["max_freq", "To, Hz", "135 (133.3)"], ["hz_per_sec", "Hz per second", "1"],
   ["accel_per_hz", "Acceleration per Hz, mm/s", "60 (75)"], ["sweeping_accel", "Sweeping acceleration, mm/s²", "400 (0)"],
 ];
+const FACTS = [
+  ["sensor_turned", "The sensor was mounted differently for X and for Y"],
+  ["frame_firm", "The frame does not move (bolted down, heavy): what the sensor felt is what prints"],
+];
 
 /**
  * @param {{machines: any[], base: string | null, own?: boolean, signal: AbortSignal}} about `base`:
@@ -87,12 +91,16 @@ export function measurementPanel({ machines, base, own = false, signal }) {
 /** How the test was run, where it was not Klipper's default; folded away. */
 function testOptions() {
   const inputs = TEST.map(([name, , hint]) => h("input", { type: "number", id: `test-${name}`, min: "0", step: "any", placeholder: hint }));
+  const boxes = FACTS.map(([name]) => h("input", { type: "checkbox", id: `test-${name}` }));
   const axis = h("select", { id: "test-axis" }, [["", "As the files say"], ["x", "X"], ["y", "Y"]].map(([value, text]) => h("option", { value }, text)));
   const element = h("details", null, h("summary", null, "How the test was run"),
     h("p.hint", null, "Empty: as the file says, else Klipper's default as shown; in brackets that of Klipper before 2024-12. Of a table of resonances only what lies between From and To is fitted."),
     h("div.fields", null,
       h("div.field", null, h("label", { for: "test-axis" }, "Axis"), axis),
-      TEST.map(([name, label], k) => h("div.field", null, h("label", { for: `test-${name}` }, label), inputs[k]))));
-  const read = () => ({ axis: axis.value, ...Object.fromEntries(TEST.map(([name], k) => [name, inputs[k].value])) });
+      TEST.map(([name, label], k) => h("div.field", null, h("label", { for: `test-${name}` }, label), inputs[k]))),
+    FACTS.map(([name, label], k) => h("label.check", { for: `test-${name}` }, boxes[k], label)));
+  const read = () => ({ axis: axis.value,
+    ...Object.fromEntries(TEST.map(([name], k) => [name, inputs[k].value])),
+    ...Object.fromEntries(FACTS.map(([name], k) => [name, boxes[k].checked ? "true" : ""])) });
   return { element, read };
 }
