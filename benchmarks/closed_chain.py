@@ -50,7 +50,7 @@ from stillpath.applications.machines.checks import derived_envelope
 from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
 from stillpath.models.firmware.klipper import Klipper
-from stillpath.models.friction import DryFriction
+from stillpath.models.friction import DryFriction, usual_guides
 from stillpath.models.identification.identify import Measured, identify
 from stillpath.models.identification.readers import ReadSettings, read_content
 from stillpath.models.identification.shaper_choice import choose_shaper_of
@@ -332,6 +332,7 @@ def identified(
         f_end_hz=test.f_end_hz,
         hz_per_s=test.hz_per_s,
         sweeping_accel_mm_s2=test.sweeping_accel_mm_s2,
+        guides=usual_guides(base.kinematics),
     )
     measured, shapers = [], []
     typed: dict[str, PlantSetSpec] = {}

@@ -106,6 +106,13 @@ class ReaderOptions:
             "prints.",
         ),
     ] = False
+    guides: Annotated[
+        Literal["wheels", "rails"] | None,
+        typer.Option(
+            help="What the axes run on, for the friction that tables do not show. Default: wheels "
+            "(or bushings) where kinematics are cartesian, else rails."
+        ),
+    ] = None
     columns: Annotated[
         str | None,
         typer.Option(metavar="T,U,Y", help="Columns of time, command and measurement of a drive."),

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 
@@ -32,17 +33,21 @@ __all__ = [
     "CREEP_S",
     "LEAST_MM_S2",
     "DryFriction",
+    "Guides",
     "bend_of",
     "held_back_mm",
+    "usual_guides",
     "with_least_friction",
 ]
 
+Guides = Literal["wheels", "rails"]
+"""What an axis runs on; bushings on rods count as wheels."""
 BEND_MM = 0.01
 """Travel over which friction reverses: 5 to 20 um on rolling and sliding guides. Half or twice as
 much changes contour errors by a few per cent."""
 CREEP_S = 0.05
 """Time constant of a bend while an axis stands. 0.03 and 0.1 are about as good (docs/tried.md)."""
-LEAST_MM_S2 = 75.0
+LEAST_MM_S2: dict[Guides, float] = {"wheels": 150.0, "rails": 75.0}
 """Dry friction over moving mass that is assumed where none could be measured. Most guides rub more;
 more would make stiff printers with light guides worse (docs/tried.md)."""
 _FRAME_BELOW = 0.8
@@ -61,18 +66,24 @@ def held_back_mm(plants: PlantSetSpec, accel_mm_s2: float) -> float:
     return accel_mm_s2 * bend_s2
 
 
-def with_least_friction(plants: PlantSetSpec) -> PlantSetSpec:
+def usual_guides(kinematics: str) -> Guides:
+    """Return what the axes of most such machines run on."""
+    return "wheels" if kinematics == "cartesian" else "rails"
+
+
+def with_least_friction(plants: PlantSetSpec, guides: Guides = "rails") -> PlantSetSpec:
     """Return plants whose measurement cannot show friction with the least that guides have.
 
     Modes well below the main one may be the frame's, which friction inside the printer does not
     bend.
     """
-    held_mm, nominal = held_back_mm(plants, LEAST_MM_S2), plants.nominal
+    least_mm_s2 = LEAST_MM_S2[guides]
+    held_mm, nominal = held_back_mm(plants, least_mm_s2), plants.nominal
     if isinstance(nominal, RelativeModesSpec):
         main = max(nominal.modes, key=lambda mode: abs(mode.share))
         springs = [mode for mode in nominal.modes if mode.f_hz >= _FRAME_BELOW * main.f_hz]
         bend_s2 = sum(mode.share / (2.0 * np.pi * mode.f_hz) ** 2 for mode in springs)
-        held_mm = min(held_mm, LEAST_MM_S2 * abs(bend_s2))
+        held_mm = min(held_mm, least_mm_s2 * abs(bend_s2))
     return plants.with_friction(min(held_mm, MOST_FRICTION_MM), assumed=True)
 
 

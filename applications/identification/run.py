@@ -14,6 +14,7 @@ from pydantic import ValidationError
 from stillpath.applications.identification.figures import IdentificationReport
 from stillpath.applications.identification.report import identification_report
 from stillpath.models.errors import ModelError
+from stillpath.models.friction import usual_guides
 from stillpath.models.identification.conditioned import schedulable
 from stillpath.models.identification.conditions import Condition
 from stillpath.models.identification.identify import Measured, Progress, identify
@@ -99,6 +100,8 @@ def identify_files(
         If a file cannot be used (the message names it), or its plants do not fit the machine.
     """
     settings = settings or ReadSettings()
+    if settings.guides is None:
+        settings = settings.model_copy(update={"guides": usual_guides(base.kinematics)})
     measured = _read(files, settings, progress)
     sources = [file.source for file in files]
     identified = identify(

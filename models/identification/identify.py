@@ -55,9 +55,9 @@ from stillpath.models.identification.prompt import prompt
 from stillpath.models.identification.readers import (
     ReadSettings,
     date_in_name,
-    direction_of,
     excitation_for,
     excitation_notes,
+    tested_axis,
 )
 from stillpath.models.identification.sets import (
     Origin,
@@ -144,7 +144,7 @@ def identify(
     settings = settings or ReadSettings()
     groups: dict[Axis, list[Measured]] = {}
     for one in measured:
-        groups.setdefault(_axis(one.measurement, settings), []).append(one)
+        groups.setdefault(tested_axis(one.measurement, settings), []).append(one)
     if not groups:
         raise ModelError("nothing to identify: give at least one measurement")
     steps = _Steps(progress, len(measured) + len(groups))
@@ -244,7 +244,7 @@ class _AxisWork:
                 self.late = []
                 found = self._from_magnitudes(fault, frame_likely)
         self._steps.stepped(f"axis {self._axis}: fitted")
-        notes = [*found.notes, *friction_notes(found.plants)]
+        notes = [*found.notes, *friction_notes(found.plants, self._settings.guides)]
         used = [one.measurement for one in self._used]
         notes += by_file((m.source, n) for m in used for n in m.notes)
         for one in self._left_out:
@@ -339,7 +339,11 @@ class _AxisWork:
             notes += table_mounting_notes(self._axis, [s for s, _, _ in spectra])
         common = usual([c for _, _, c in spectra], self._axis)
         found = spectrum_set(
-            self._explanations, axis=self._axis, frame_likely=frame_likely, origin=self._origin
+            self._explanations,
+            axis=self._axis,
+            frame_likely=frame_likely,
+            guides=self._settings.guides or "rails",
+            origin=self._origin,
         )
         nominal = found.fit
         assert nominal is not None
@@ -477,22 +481,3 @@ class _AxisWork:
 
     def _rubbing(self, plants: PlantSetSpec) -> PlantSetSpec:
         return plants.with_friction(self._friction_mm) if self._friction_mm else plants
-
-
-def _axis(measurement: Measurement, settings: ReadSettings) -> Axis:
-    text = settings.axis or measurement.axis
-    if text is None:
-        raise ModelError(
-            f"{measurement.source}: neither the file nor its name says which axis it is of; give "
-            "the axis, x or y"
-        )
-    try:
-        x, y = direction_of(text)
-    except ModelError as error:
-        raise ModelError(f"{measurement.source}: {error}") from None
-    if min(abs(x), abs(y)) > 1e-6:
-        raise ModelError(
-            f"{measurement.source}: measured along {text}, which moves both axes at once; identify "
-            "X and Y from tests along X and along Y"
-        )
-    return "x" if abs(x) > abs(y) else "y"

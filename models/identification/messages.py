@@ -9,7 +9,7 @@ import numpy as np
 
 from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
-from stillpath.models.friction import LEAST_MM_S2
+from stillpath.models.friction import LEAST_MM_S2, Guides
 from stillpath.models.identification.estimation import plateau_gain
 from stillpath.models.identification.nozzle import Frame
 from stillpath.models.identification.readers.checks import RANGE_ENDED
@@ -115,15 +115,15 @@ def body_notes(friction_mm: float, frame: Frame | None) -> list[str]:
     return notes
 
 
-def friction_notes(plants: PlantSetSpec) -> list[str]:
+def friction_notes(plants: PlantSetSpec, guides: Guides | None) -> list[str]:
     """Return what is assumed of friction, which neither spectra show nor logs without a model."""
     if not plants.friction_assumed:
         return []
-    held_um = 1e3 * (plants.friction_mm or 0.0)
+    held_um, guides = 1e3 * (plants.friction_mm or 0.0), guides or "rails"
     note = (
         "dry friction is not known (raw logs that a model explains show it): "
-        f"{1e-3 * LEAST_MM_S2:g} N per kg of moving mass is assumed, which holds the axis "
-        f"{held_um:.1f} µm behind its command"
+        f"{1e-3 * LEAST_MM_S2[guides]:g} N per kg of moving mass is assumed, as for light "
+        f"{guides} (option guides), which holds the axis {held_um:.1f} µm behind its command"
     )
     return [note]
 

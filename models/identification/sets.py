@@ -16,7 +16,7 @@ from pydantic import ValidationError
 
 from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
-from stillpath.models.friction import with_least_friction
+from stillpath.models.friction import Guides, with_least_friction
 from stillpath.models.identification.averaging import mean_response
 from stillpath.models.identification.frame import LIKELY
 from stillpath.models.identification.modal_fit import fit_modes, refit
@@ -158,6 +158,7 @@ def spectrum_set(
     *,
     axis: str,
     frame_likely: float = LIKELY,
+    guides: Guides = "rails",
     origin: Origin = _UNKNOWN,
 ) -> AxisIdentification:
     """Identify an axis from what explains its spectra, within their scatter.
@@ -166,6 +167,8 @@ def spectrum_set(
     ----------
     frame_likely : float
         Probability that a weak mode far below the strongest is the frame's (`frame.likely_of`).
+    guides : str
+        Whose least friction is assumed, as spectra show none.
     """
     found = explanations.explained(frame_likely)
     fit, population = found.fit, found.population
@@ -181,7 +184,7 @@ def spectrum_set(
             origin=origin,
         ),
     )
-    plants = with_least_friction(plants)
+    plants = with_least_friction(plants, guides)
     return AxisIdentification(
         axis=axis, plants=plants, fit=fit, measured=explanations.spectra, warnings=fit.notes
     )

@@ -79,6 +79,7 @@ class _Reading:
     ] = None
     sensor_turned: bool = False
     frame_firm: bool = False
+    guides: Annotated[str | None, Query(description="Of the axes: wheels or rails.")] = None
     repair_rounding: bool = False
     dc_gain: Annotated[float | None, Query(gt=0, description="DC gain that a model may have.")] = (
         None

@@ -7,6 +7,7 @@ from stillpath.models.identification.readers.settings import (
     direction_of,
     excitation_for,
     excitation_notes,
+    tested_axis,
 )
 
 __all__ = [
@@ -17,4 +18,5 @@ __all__ = [
     "excitation_notes",
     "read_content",
     "read_measurements",
+    "tested_axis",
 ]

@@ -12,7 +12,14 @@ from pydantic import Field, field_validator, model_validator
 
 from stillpath.models.document import Document, NonNegative, Positive
 from stillpath.models.errors import ModelError
-from stillpath.models.identification.types import AccelerationLog, Excitation, Spectrum
+from stillpath.models.friction import Guides
+from stillpath.models.identification.types import (
+    AccelerationLog,
+    Axis,
+    Excitation,
+    Measurement,
+    Spectrum,
+)
 
 __all__ = [
     "ReadSettings",
@@ -20,6 +27,7 @@ __all__ = [
     "direction_of",
     "excitation_for",
     "excitation_notes",
+    "tested_axis",
 ]
 
 Column = str | Annotated[int, Field(ge=0)]
@@ -78,6 +86,9 @@ class ReadSettings(Document):
         The frame stands firm (bolted down, heavy): what the sensor feels is what prints. Otherwise
         a weak mode far below the strongest may be the frame on its feet, which an accelerometer
         feels and the nozzle over the bed does not.
+    guides : str, optional
+        What the axes run on: "wheels" (or bushings on rods) or "rails", for the friction that is
+        assumed where none can be measured. None: rails, which rub least.
     time_column, command_column, measured_column, axis_column : str or int, optional
         Columns of a recorded drive, by name or counted from 0.
     acceleration_unit, magnitude_unit : str, optional
@@ -102,6 +113,7 @@ class ReadSettings(Document):
     sensor_axis: Literal["x", "y", "z"] | None = None
     sensor_turned: bool = False
     frame_firm: bool = False
+    guides: Guides | None = None
     time_column: Column | None = None
     command_column: Column | None = None
     measured_column: Column | None = None
@@ -159,6 +171,32 @@ def direction_of(axis: str, *, allow_z: bool = False) -> tuple[float, float]:
     if text == "z":
         remedy = "only X and Y are compensated, so leave out tests along Z"
     raise ModelError(f"axis {axis!r} is not a direction of the plane; {remedy}")
+
+
+def tested_axis(measurement: Measurement, settings: ReadSettings) -> Axis:
+    """Return the axis of the machine that a measurement is of.
+
+    Raises
+    ------
+    ModelError
+        If nothing says it, or the test moved both axes at once.
+    """
+    text = settings.axis or measurement.axis
+    if text is None:
+        raise ModelError(
+            f"{measurement.source}: neither the file nor its name says which axis it is of; give "
+            "the axis, x or y"
+        )
+    try:
+        x, y = direction_of(text)
+    except ModelError as error:
+        raise ModelError(f"{measurement.source}: {error}") from None
+    if min(abs(x), abs(y)) > 1e-6:
+        raise ModelError(
+            f"{measurement.source}: measured along {text}, which moves both axes at once; identify "
+            "X and Y from tests along X and along Y"
+        )
+    return "x" if abs(x) > abs(y) else "y"
 
 
 def excitation_for(

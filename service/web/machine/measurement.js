@@ -92,14 +92,18 @@ export function measurementPanel({ machines, base, own = false, signal }) {
 function testOptions() {
   const inputs = TEST.map(([name, , hint]) => h("input", { type: "number", id: `test-${name}`, min: "0", step: "any", placeholder: hint }));
   const boxes = FACTS.map(([name]) => h("input", { type: "checkbox", id: `test-${name}` }));
-  const axis = h("select", { id: "test-axis" }, [["", "As the files say"], ["x", "X"], ["y", "Y"]].map(([value, text]) => h("option", { value }, text)));
+  const chooser = (/** @type {string} */ id, /** @type {string[][]} */ choices) =>
+    h("select", { id }, choices.map(([value, text]) => h("option", { value }, text)));
+  const axis = chooser("test-axis", [["", "As the files say"], ["x", "X"], ["y", "Y"]]);
+  const guides = chooser("test-guides", [["", "Usual for its kinematics"], ["wheels", "Wheels or bushings"], ["rails", "Rails"]]);
   const element = h("details", null, h("summary", null, "How the test was run"),
     h("p.hint", null, "Empty: as the file says, else Klipper's default as shown; in brackets that of Klipper before 2024-12. Of a table of resonances only what lies between From and To is fitted."),
     h("div.fields", null,
       h("div.field", null, h("label", { for: "test-axis" }, "Axis"), axis),
+      h("div.field", null, h("label", { for: "test-guides" }, "Guides"), guides),
       TEST.map(([name, label], k) => h("div.field", null, h("label", { for: `test-${name}` }, label), inputs[k]))),
     FACTS.map(([name, label], k) => h("label.check", { for: `test-${name}` }, boxes[k], label)));
-  const read = () => ({ axis: axis.value,
+  const read = () => ({ axis: axis.value, guides: guides.value,
     ...Object.fromEntries(TEST.map(([name], k) => [name, inputs[k].value])),
     ...Object.fromEntries(FACTS.map(([name], k) => [name, boxes[k].checked ? "true" : ""])) });
   return { element, read };

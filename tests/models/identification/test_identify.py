@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy.signal import hilbert
 
-from stillpath.applications.identification.run import InputFile
+from stillpath.applications.identification.run import InputFile, identify_files
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.conditioned import Tested, of_one_test
 from stillpath.models.identification.conditions import Condition
@@ -44,6 +44,7 @@ from stillpath.models.plants import (
     frequency_response,
 )
 from stillpath.models.schedule import AxisSchedule, MassSchedule
+from stillpath.models.store import load_machine
 from tests.models.identification.recordings import (
     LEGACY,
     QUICK,
@@ -135,14 +136,28 @@ def test_the_best_kind_is_used_and_the_others_are_named() -> None:
     assert not found.plants.friction_assumed
 
 
-def test_tables_do_not_show_friction_so_a_little_is_assumed() -> None:
-    found = one(spectrum_file(one_mode(50.0, 0.06), QUICK, sensor=Sensor(rate_hz=1600.0)))
+@pytest.mark.parametrize(
+    ("guides", "least_mm_s2"), [(None, 75.0), ("rails", 75.0), ("wheels", 150.0)]
+)
+def test_tables_do_not_show_friction_so_a_little_is_assumed(
+    guides: str | None, least_mm_s2: float
+) -> None:
+    table = spectrum_file(one_mode(50.0, 0.06), QUICK, sensor=Sensor(rate_hz=1600.0))
+    found = one(table, settings=SETTINGS.model_copy(update={"guides": guides}))
     assert found.plants.friction_assumed
-    held_mm = 75.0 / (2.0 * np.pi * 50.0) ** 2
+    held_mm = least_mm_s2 / (2.0 * np.pi * 50.0) ** 2
     assert found.plants.friction_mm == pytest.approx(held_mm, rel=0.1)
-    assert any(
-        "0.075 N per kg" in note and f"{1e3 * held_mm:.1f} µm" in note for note in found.notes
-    )
+    assumed = f"{1e-3 * least_mm_s2:g} N per kg"
+    assert any(assumed in n and f"{1e3 * held_mm:.1f} µm" in n for n in found.notes)
+
+
+@pytest.mark.parametrize(
+    ("base", "assumed"), [("generic-bedslinger", "0.15 N per kg"), ("generic-corexy", "0.075 N")]
+)
+def test_beds_that_move_mostly_run_on_wheels(base: str, assumed: str) -> None:
+    table = spectrum_file(one_mode(50.0, 0.06), QUICK, sensor=Sensor(rate_hz=1600.0))
+    (axis,) = identify_files([table], load_machine(base), SETTINGS).report.axes
+    assert any(assumed in note for note in axis.notes)
 
 
 def test_a_model_goes_before_measurements() -> None:
