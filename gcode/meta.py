@@ -19,6 +19,13 @@ __all__ = ["META_WORDS", "expression_line", "held_back", "meta_command"]
 _OPENING = ("if", "elif", "else", "while")
 _HARMLESS = ("var", "global", "set", "echo", "skip")
 META_WORDS = frozenset({*_OPENING, *_HARMLESS, "break", "continue", "abort"})
+_LIMITS = frozenset({"M201", "M203", "M204", "M205", "M207", "M566"})
+_ADVANCE = "M572"
+_WHATEVER_VALUES = (EventKind.HARMLESS, EventKind.STOP, EventKind.SHAPER)
+"""A shaper's line is said again as it is."""
+_HEATS = frozenset({"M109", "G10"})
+_OFFSETS = frozenset("LXYZUVWABCD")
+"""Words with which G10 sets more than temperatures."""
 
 
 def meta_command(state: MachineState, command: Command) -> int:
@@ -37,8 +44,13 @@ def meta_command(state: MachineState, command: Command) -> int:
 
 def expression_line(state: MachineState, word: Word, command: Command) -> int:
     """Pass a line by whose values only the firmware can work out; a move's own E and F count."""
-    if isinstance(word, EventKind) and word in (EventKind.HARMLESS, EventKind.STOP):
+    if isinstance(word, EventKind) and word in _WHATEVER_VALUES:
         return state.event(word)
+    heats = command.name in _HEATS and not _OFFSETS & command.words.keys()
+    if heats and not isinstance(word, Action | EventKind):
+        return word(state, command)
+    if command.name in _LIMITS or command.name == _ADVANCE:
+        return _setting(state, command)
     if isinstance(word, Action) and word <= Action.ARC_CCW:
         stated = {k: v for k, v in command.words.items() if k in "EF" and v and v[0] not in "{:"}
         if "F" in stated:
@@ -49,6 +61,25 @@ def expression_line(state: MachineState, word: Word, command: Command) -> int:
             _feed(state, state.number(stated["E"], "E", command))
     state.warn("the line holds an expression; from here on the position is not known")
     state.forget(origin=_may_shift(word))
+    return state.event(EventKind.UNKNOWN)
+
+
+def _setting(state: MachineState, command: Command) -> int:
+    """Pass a limit or pressure advance by; a stream holds the latter, so moves wait for a number.
+
+    Coordinates are read as before.
+    """
+    if command.name == _ADVANCE:
+        state.warn(
+            "M572 with an expression: pressure advance is not known before the print, so moves "
+            "stay as sliced from here to an M572 with a number"
+        )
+        state.hold("pressure advance", True)
+    else:
+        state.warn(
+            f"{command.name} with an expression: its values are not known before the print, and "
+            "behind compensated stretches the machine's are in force; write numbers"
+        )
     return state.event(EventKind.UNKNOWN)
 
 

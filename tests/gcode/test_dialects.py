@@ -532,6 +532,33 @@ def test_meta_commands_are_barriers(read) -> None:
     assert any("expression" in text for text in interpreter.warnings)
 
 
+@pytest.mark.parametrize(
+    ("line", "known"),
+    [
+        ("G10 P0 S{var.t} R{var.t}", 7),
+        ("M109 S{var.t}", 7),
+        ('M593 P"zvd" F{var.f}', 7),
+        ("M204 P{var.a} T{var.a}", 3),
+        ("M207 S{var.l}", 3),
+        ("G10 P0 X{var.x}", 0),
+        ("G92 X{var.x}", 0),
+    ],
+)
+def test_an_expression_leaves_coordinates_alone_that_its_line_does_not_set(
+    line: str, known: int, read
+) -> None:
+    text = f"G28\nT0\nG1 X9 Y9 Z1 F600\n{line}\nG1 X8 Y8\nG1 X7 Y7\n"
+    assert read(text, "reprapfirmware")[0].moves.known[-1] == known
+
+
+def test_moves_wait_for_a_pressure_advance_that_is_a_number(read) -> None:
+    """A stream's filament holds it."""
+    text = "G28\nT0\nM572 D0 S{var.k}\nG28\nG1 X9 Y9 Z1 F600\nM572 S0.1\nG1 X8 Y8\n"
+    block, interpreter = read(text, "reprapfirmware")
+    assert (block.moves.known & 8).tolist() == [8, 0]
+    assert any("M572 with an expression" in text for text in interpreter.warnings)
+
+
 def test_saved_places_are_as_many_as_the_firmware_has(read) -> None:
     text = "".join(f"G60 S{slot}\n" for slot in range(300))
     assert len(read(text, "marlin")[1].state.saved) == 256

@@ -107,7 +107,10 @@ def pressure_advance(state: MachineState, command: Command) -> int:
     used = str(state.i[at.I_TOOL])
     extruders = command.words.get("D", used).strip("{}").split(":")
     state.factors.update((f"advance {extruder}", given["S"]) for extruder in extruders)
-    values = {"pressure_advance_s": given["S"]} if used in extruders else {}
+    values = {}
+    if used in extruders:
+        values = {"pressure_advance_s": given["S"]}
+        state.hold("pressure advance", False)
     return state.set_limits(command, values, remember=False, kind=EventKind.SHAPER)
 
 
