@@ -19,8 +19,8 @@ __all__ = ["META_WORDS", "expression_line", "held_back", "meta_command"]
 _OPENING = ("if", "elif", "else", "while")
 _HARMLESS = ("var", "global", "set", "echo", "skip")
 META_WORDS = frozenset({*_OPENING, *_HARMLESS, "break", "continue", "abort"})
-_LIMITS = frozenset({"M201", "M203", "M204", "M205", "M207", "M566"})
 _ADVANCE = "M572"
+_SETTINGS = frozenset({"M201", "M203", "M204", "M205", "M207", "M566", _ADVANCE})
 _WHATEVER_VALUES = (EventKind.HARMLESS, EventKind.STOP, EventKind.SHAPER)
 """A shaper's line is said again as it is."""
 _HEATS = frozenset({"M109", "G10"})
@@ -49,7 +49,7 @@ def expression_line(state: MachineState, word: Word, command: Command) -> int:
     heats = command.name in _HEATS and not _OFFSETS & command.words.keys()
     if heats and not isinstance(word, Action | EventKind):
         return word(state, command)
-    if command.name in _LIMITS or command.name == _ADVANCE:
+    if command.name in _SETTINGS:
         return _setting(state, command)
     if isinstance(word, Action) and word <= Action.ARC_CCW:
         stated = {k: v for k, v in command.words.items() if k in "EF" and v and v[0] not in "{:"}
@@ -71,14 +71,15 @@ def _setting(state: MachineState, command: Command) -> int:
     """
     if command.name == _ADVANCE:
         state.warn(
-            "M572 with an expression: pressure advance is not known before the print, so moves "
-            "stay as sliced from here to an M572 with a number"
+            "M572 under a condition or with an expression: pressure advance is not known before "
+            "the print, so moves stay as sliced from here to an M572 with a number"
         )
         state.hold("pressure advance", True)
     else:
         state.warn(
-            f"{command.name} with an expression: its values are not known before the print, and "
-            "behind compensated stretches the machine's are in force; write numbers"
+            f"{command.name} under a condition or with an expression: its values are not known "
+            "before the print, and behind compensated stretches the machine's, or those of the "
+            "file's other lines, are in force; write numbers"
         )
     return state.event(EventKind.UNKNOWN)
 
@@ -97,6 +98,8 @@ def held_back(state: MachineState, command: Command) -> int | None:
     word = state.dialect.word(command.name)
     if word == EventKind.HARMLESS:
         return state.event(EventKind.HARMLESS)
+    if command.name in _SETTINGS:
+        return _setting(state, command)
     state.forget(origin=_may_shift(word))
     return state.event(EventKind.UNKNOWN)
 

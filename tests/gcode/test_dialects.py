@@ -551,12 +551,20 @@ def test_an_expression_leaves_coordinates_alone_that_its_line_does_not_set(
     assert read(text, "reprapfirmware")[0].moves.known[-1] == known
 
 
-def test_moves_wait_for_a_pressure_advance_that_is_a_number(read) -> None:
+@pytest.mark.parametrize("line", ["M572 D0 S{var.k}", "if global.petg\n  M572 D0 S0.06"])
+def test_moves_wait_for_a_pressure_advance_that_is_a_number(line: str, read) -> None:
     """A stream's filament holds it."""
-    text = "G28\nT0\nM572 D0 S{var.k}\nG28\nG1 X9 Y9 Z1 F600\nM572 S0.1\nG1 X8 Y8\n"
+    text = f"G28\nT0\n{line}\nG28\nG1 X9 Y9 Z1 F600\nM572 S0.1\nG1 X8 Y8\n"
     block, interpreter = read(text, "reprapfirmware")
     assert (block.moves.known & 8).tolist() == [8, 0]
-    assert any("M572 with an expression" in text for text in interpreter.warnings)
+    assert any("M572 under a condition" in text for text in interpreter.warnings)
+
+
+def test_limits_under_a_condition_leave_coordinates_alone(read) -> None:
+    text = "G28\nG1 X9 Y9 Z1 F600\nif true\n  M204 P500 T500\nG1 X8 Y8\nG1 X7 Y7\n"
+    block, interpreter = read(text, "reprapfirmware")
+    assert block.moves.known.tolist() == [7, 0, 3]
+    assert any("M204 under a condition" in text for text in interpreter.warnings)
 
 
 def test_saved_places_are_as_many_as_the_firmware_has(read) -> None:
