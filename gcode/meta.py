@@ -46,8 +46,7 @@ def expression_line(state: MachineState, word: Word, command: Command) -> int:
     """Pass a line by whose values only the firmware can work out; a move's own E and F count."""
     if isinstance(word, EventKind) and word in _WHATEVER_VALUES:
         return state.event(word)
-    heats = command.name in _HEATS and not _OFFSETS & command.words.keys()
-    if heats and not isinstance(word, Action | EventKind):
+    if _heats(command) and not isinstance(word, Action | EventKind):
         return word(state, command)
     if command.name in _SETTINGS:
         return _setting(state, command)
@@ -100,8 +99,18 @@ def held_back(state: MachineState, command: Command) -> int | None:
         return state.event(EventKind.HARMLESS)
     if command.name in _SETTINGS:
         return _setting(state, command)
-    state.forget(origin=_may_shift(word))
+    if command.name[:1] == "T" and not isinstance(word, Action | EventKind):
+        status = word(state, command)  # who asks for a tool under a condition has it afterwards
+        state.tool_known = False
+        return status
+    if command.name != "G28" and not _heats(command):
+        state.forget(origin=_may_shift(word))
     return state.event(EventKind.UNKNOWN)
+
+
+def _heats(command: Command) -> bool:
+    """Return whether a command only sets temperatures, and waits for them."""
+    return command.name in _HEATS and not _OFFSETS & command.words.keys()
 
 
 def _may_shift(word: Word) -> bool:

@@ -560,6 +560,29 @@ def test_moves_wait_for_a_pressure_advance_that_is_a_number(line: str, read) -> 
     assert any("M572 under a condition" in text for text in interpreter.warnings)
 
 
+@pytest.mark.parametrize(
+    ("line", "known"),
+    [
+        ("G28", 3),
+        ("T0", 3),
+        ("M109 S200", 3),
+        ("G10 P0 S200", 3),
+        ("M190 S60", 3),
+        ("G92 X5", 0),
+        ("G10 P0 X5", 0),
+        ("G91", 0),
+    ],
+)
+def test_a_condition_leaves_coordinates_alone_that_its_lines_do_not_set(
+    line: str, known: int, read
+) -> None:
+    """Start codes home where the printer is not homed, and fetch a tool where none is in use."""
+    text = f"G28\nG1 X9 Y9 Z1 F600\nif !move.axes[0].homed\n  {line}\nG1 X8 Y8\nG1 X7 Y7\n"
+    block, _ = read(text, "reprapfirmware")
+    assert block.moves.known.tolist() == [7, 0, known]
+    assert block.events.kind.tolist() == [EventKind.UNKNOWN] * 3
+
+
 def test_limits_under_a_condition_leave_coordinates_alone(read) -> None:
     text = "G28\nG1 X9 Y9 Z1 F600\nif true\n  M204 P500 T500\nG1 X8 Y8\nG1 X7 Y7\n"
     block, interpreter = read(text, "reprapfirmware")
