@@ -95,7 +95,7 @@ def held_back(state: MachineState, command: Command) -> int | None:
         harmless = command.name in _HARMLESS
         return state.event(EventKind.HARMLESS if harmless else EventKind.UNKNOWN)
     word = state.dialect.word(command.name)
-    if word == EventKind.HARMLESS:
+    if word == EventKind.HARMLESS or _is_in_force(state, word, command):
         return state.event(EventKind.HARMLESS)
     if command.name in _SETTINGS:
         return _setting(state, command)
@@ -106,6 +106,22 @@ def held_back(state: MachineState, command: Command) -> int | None:
     if command.name != "G28" and not _heats(command):
         state.forget(origin=_may_shift(word))
     return state.event(EventKind.UNKNOWN)
+
+
+def _is_in_force(state: MachineState, word: Word, command: Command) -> bool:
+    """Return whether a command sets the mode that there is, so that nobody needs to know of it."""
+    if not isinstance(word, Action):
+        return False
+    xyz, e = bool(state.i[at.I_ABS_XYZ]), bool(state.i[at.I_ABS_E])
+    return {
+        Action.ABSOLUTE: xyz,
+        Action.RELATIVE: not xyz,
+        Action.ABSOLUTE_E: e,
+        Action.RELATIVE_E: not e,
+        Action.MILLIMETRES: bool(state.f[at.F_UNIT_MM] == 1.0),
+        # The place of E counts where E is absolute.
+        Action.SET_POSITION: not e and command.words.keys() <= {"E"},
+    }.get(word, False)
 
 
 def _heats(command: Command) -> bool:

@@ -583,6 +583,27 @@ def test_a_condition_leaves_coordinates_alone_that_its_lines_do_not_set(
     assert block.events.kind.tolist() == [EventKind.UNKNOWN] * 3
 
 
+@pytest.mark.parametrize(
+    ("before", "line", "known"),
+    [
+        ("M83", "M83", 3),
+        ("M83", "G92 E0", 3),
+        ("M83", "G90", 3),
+        ("M83", "G21", 3),
+        ("M83", "M82", 0),
+        ("M82", "M83", 0),
+        ("M82", "G92 E0", 0),
+        ("M83", "G92 E0 X0", 0),
+        ("G91", "G90", 0),
+    ],
+)
+def test_a_mode_that_is_in_force_needs_no_condition(
+    before: str, line: str, known: int, read
+) -> None:
+    text = f"G28\nG1 X9 Y9 Z1 F600\n{before}\nif true\n  {line}\nG90\nG1 X8 Y8\nG1 X7 Y7\n"
+    assert read(text, "reprapfirmware")[0].moves.known[-1] == known
+
+
 def test_limits_under_a_condition_leave_coordinates_alone(read) -> None:
     text = "G28\nG1 X9 Y9 Z1 F600\nif true\n  M204 P500 T500\nG1 X8 Y8\nG1 X7 Y7\n"
     block, interpreter = read(text, "reprapfirmware")
