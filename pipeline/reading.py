@@ -21,7 +21,8 @@ __all__ = ["dialect_for", "doubts", "extruder_mode_awaited", "passed_over"]
 _SHOWN = 5
 _END_BYTES = 1 << 18
 _BEGINNING_BYTES = 1 << 20
-_MODE = re.compile(rb"^[^;\n]*\bM8[23](?!\d)", re.MULTILINE | re.IGNORECASE)
+_MODE = re.compile(rb"^(?:[^;\s][^;\n]*)?\bM8[23](?!\d)", re.MULTILINE | re.IGNORECASE)
+"""Not indented, for that may be under a condition."""
 _FEEDS = re.compile(rb"^[ \t]*(?:N\d+[ \t]*)?G0*[0-3](?!\d)[^;\n]*E", re.MULTILINE | re.IGNORECASE)
 _OFFSHOOTS = ("prusa", "bambu")
 """Dialects that may be requested for a Marlin machine."""

@@ -241,6 +241,7 @@ def test_filament_fed_before_the_file_says_a_mode_stays_as_sliced(
     assert before.endswith(_PURGE.rstrip())
     assert "M82" not in before
     assert "stream on" in after
+    assert written(f"if true\n  M83\n{_PURGE}M83\n{_PART}")[1]
     for text in (f"M83\n{_PURGE}{_PART}", f"; M83\nG28\nG90 M83\n{_PURGE}{_PART}"):
         found, warned = written(text)
         assert not warned
