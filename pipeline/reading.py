@@ -20,7 +20,8 @@ __all__ = ["dialect_for", "doubts", "extruder_mode_awaited", "passed_over"]
 
 _SHOWN = 5
 _END_BYTES = 1 << 18
-_BEGINNING_BYTES = 1 << 20
+_BEGINNING_BYTES = 1 << 23
+"""Pictures may come first."""
 _MODE = re.compile(rb"^(?:[^;\s][^;\n]*)?\bM8[23](?!\d)", re.MULTILINE | re.IGNORECASE)
 """Not indented, for that may be under a condition."""
 _FEEDS = re.compile(rb"^[ \t]*(?:N\d+[ \t]*)?G0*[0-3](?!\d)[^;\n]*E", re.MULTILINE | re.IGNORECASE)
