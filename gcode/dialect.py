@@ -148,6 +148,8 @@ class Dialect:
     """A word without a number is ignored, not refused."""
     bad_arcs_pass: bool = False
     """An arc without centre is ignored, not refused."""
+    extruder_mode_known: bool = True
+    """E is absolute before the first M82 or M83; otherwise moves stay as they are up to it."""
     tool_at_start: bool = True
     """Tool 0 is in use before the first T."""
     odd_words: str = ""

@@ -27,7 +27,7 @@ from stillpath.gcode.firmware.dialects import dialect_of
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.lexer import Command, check_line_ends, further_words, odd_numbers, split_line
 from stillpath.gcode.meta import META_WORDS, expression_line, held_back, meta_command
-from stillpath.gcode.state import MachineState, nobody
+from stillpath.gcode.state import EXTRUDER_MODE, MachineState, nobody
 from stillpath.gcode.types import KEPT, EventKind, Events, Limits, ModalState, Moves, ProgramBlock
 from stillpath.models.machine import Machine
 
@@ -78,6 +78,8 @@ class Interpreter:
         dialect = dialect or dialect_of(machine.firmware)
         limits = adapter(machine).initial_limits()
         self.state = MachineState(machine, dialect, limits, strict=strict_bounds)
+        if not dialect.extruder_mode_known:
+            self.state.hold(EXTRUDER_MODE, True)
         self._modal: list[ModalState] = []
         self._limits: list[Limits] = []
         self._pending: list[bytes] = []

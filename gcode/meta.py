@@ -19,6 +19,13 @@ __all__ = ["META_WORDS", "expression_line", "held_back", "meta_command"]
 _OPENING = ("if", "elif", "else", "while")
 _HARMLESS = ("var", "global", "set", "echo", "skip")
 META_WORDS = frozenset({*_OPENING, *_HARMLESS, "break", "continue", "abort"})
+_ADVANCE = "M572"
+_SETTINGS = frozenset({"M201", "M203", "M204", "M205", "M207", "M566", _ADVANCE})
+_WHATEVER_VALUES = (EventKind.HARMLESS, EventKind.STOP, EventKind.SHAPER)
+"""A shaper's line is said again as it is."""
+_HEATS = frozenset({"M109", "G10"})
+_OFFSETS = frozenset("LXYZUVWABCD")
+"""Words with which G10 sets more than temperatures."""
 
 
 def meta_command(state: MachineState, command: Command) -> int:
@@ -37,8 +44,12 @@ def meta_command(state: MachineState, command: Command) -> int:
 
 def expression_line(state: MachineState, word: Word, command: Command) -> int:
     """Pass a line by whose values only the firmware can work out; a move's own E and F count."""
-    if isinstance(word, EventKind) and word in (EventKind.HARMLESS, EventKind.STOP):
+    if isinstance(word, EventKind) and word in _WHATEVER_VALUES:
         return state.event(word)
+    if _heats(command) and not isinstance(word, Action | EventKind):
+        return word(state, command)
+    if command.name in _SETTINGS:
+        return _setting(state, command)
     if isinstance(word, Action) and word <= Action.ARC_CCW:
         stated = {k: v for k, v in command.words.items() if k in "EF" and v and v[0] not in "{:"}
         if "F" in stated:
@@ -49,6 +60,26 @@ def expression_line(state: MachineState, word: Word, command: Command) -> int:
             _feed(state, state.number(stated["E"], "E", command))
     state.warn("the line holds an expression; from here on the position is not known")
     state.forget(origin=_may_shift(word))
+    return state.event(EventKind.UNKNOWN)
+
+
+def _setting(state: MachineState, command: Command) -> int:
+    """Pass a limit or pressure advance by; a stream holds the latter, so moves wait for a number.
+
+    Coordinates are read as before.
+    """
+    if command.name == _ADVANCE:
+        state.warn(
+            "M572 under a condition or with an expression: pressure advance is not known before "
+            "the print, so moves stay as sliced from here to an M572 with a number"
+        )
+        state.hold("pressure advance", True)
+    else:
+        state.warn(
+            f"{command.name} under a condition or with an expression: its values are not known "
+            "before the print, and behind compensated stretches the machine's, or those of the "
+            "file's other lines, are in force; write numbers"
+        )
     return state.event(EventKind.UNKNOWN)
 
 
@@ -64,10 +95,38 @@ def held_back(state: MachineState, command: Command) -> int | None:
         harmless = command.name in _HARMLESS
         return state.event(EventKind.HARMLESS if harmless else EventKind.UNKNOWN)
     word = state.dialect.word(command.name)
-    if word == EventKind.HARMLESS:
+    if word == EventKind.HARMLESS or _is_in_force(state, word, command):
         return state.event(EventKind.HARMLESS)
-    state.forget(origin=_may_shift(word))
+    if command.name in _SETTINGS:
+        return _setting(state, command)
+    if command.name[:1] == "T" and not isinstance(word, Action | EventKind):
+        status = word(state, command)  # who asks for a tool under a condition has it afterwards
+        state.tool_known = False
+        return status
+    if command.name != "G28" and not _heats(command):
+        state.forget(origin=_may_shift(word))
     return state.event(EventKind.UNKNOWN)
+
+
+def _is_in_force(state: MachineState, word: Word, command: Command) -> bool:
+    """Return whether a command sets the mode that there is, so that nobody needs to know of it."""
+    if not isinstance(word, Action):
+        return False
+    xyz, e = bool(state.i[at.I_ABS_XYZ]), bool(state.i[at.I_ABS_E])
+    return {
+        Action.ABSOLUTE: xyz,
+        Action.RELATIVE: not xyz,
+        Action.ABSOLUTE_E: e,
+        Action.RELATIVE_E: not e,
+        Action.MILLIMETRES: bool(state.f[at.F_UNIT_MM] == 1.0),
+        # The place of E counts where E is absolute.
+        Action.SET_POSITION: not e and command.words.keys() <= {"E"},
+    }.get(word, False)
+
+
+def _heats(command: Command) -> bool:
+    """Return whether a command only sets temperatures, and waits for them."""
+    return command.name in _HEATS and not _OFFSETS & command.words.keys()
 
 
 def _may_shift(word: Word) -> bool:

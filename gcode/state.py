@@ -34,8 +34,10 @@ from stillpath.gcode.types import KEPT, OF_STATE, EventKind, Limits
 from stillpath.models.firmware import FirmwareFacts, FirmwareRetraction, Marlin, RepRapFirmware
 from stillpath.models.machine import Machine
 
-__all__ = ["MachineState", "Names", "Retraction", "Saved", "nobody"]
+__all__ = ["EXTRUDER_MODE", "MachineState", "Names", "Retraction", "Saved", "nobody"]
 
+EXTRUDER_MODE = "extruder mode"
+"""Why moves are held that feed filament before the file says M82 or M83."""
 _MEMOS = 8192
 _FIRST_ROWS = 256
 _MOST_ROWS = 4096

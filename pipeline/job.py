@@ -56,7 +56,7 @@ from stillpath.pipeline.piece_compensator import (
     deviation,
 )
 from stillpath.pipeline.progress import ProgressReports
-from stillpath.pipeline.reading import dialect_for, doubts
+from stillpath.pipeline.reading import dialect_for, doubts, extruder_mode_awaited
 from stillpath.pipeline.result import PutBack, Result, StageTime
 from stillpath.pipeline.selection import Selection, TooLarge
 from stillpath.pipeline.summary import Summary
@@ -143,7 +143,8 @@ class Job:
         if self._changes and self._adapter.refusal is not None:
             raise ModelError(f"{machine.name} cannot execute this file: {self._adapter.refusal}")
         self._design(order.cache_dir or default_cache_dir())
-        dialect = dialect_for(machine, options.dialect)
+        own = dialect_for(machine, options.dialect)
+        dialect, unsaid = extruder_mode_awaited(source, machine, own)
         self._length = LengthGuard(source, machine, dialect)
         self._reader = Interpreter(machine, dialect=dialect)
         self._checker = Interpreter(machine, dialect=dialect)
@@ -169,7 +170,7 @@ class Job:
         ends = (self._writer.header(), self._writer.footer()) if self._changes else ()
         self._sum.written = sum(len(text) for text in ends)
         self.retiming = Retiming(*ends, keep_times=options.times == "kept" or not self._changes)
-        self._sum.warnings += doubts(source, machine, options.dialect)
+        self._sum.warnings += [*doubts(source, machine, options.dialect), *unsaid]
 
     def _design(self, cache_dir: Path) -> None:
         """Tune the reference shaper and design the command."""

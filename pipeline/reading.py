@@ -3,21 +3,28 @@
 from __future__ import annotations
 
 import io
+import re
 from typing import BinaryIO
 
 from stillpath.gcode.detection import detect
 from stillpath.gcode.dialect import Dialect
 from stillpath.gcode.firmware.dialects import dialect_of
+from stillpath.gcode.firmware.reprapfirmware.dialect import awaiting_extruder_mode
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.models.errors import ModelError
-from stillpath.models.firmware import Marlin
+from stillpath.models.firmware import Marlin, RepRapFirmware
 from stillpath.models.machine import Machine
 from stillpath.pipeline.options import DialectName
 
-__all__ = ["dialect_for", "doubts", "passed_over"]
+__all__ = ["dialect_for", "doubts", "extruder_mode_awaited", "passed_over"]
 
 _SHOWN = 5
 _END_BYTES = 1 << 18
+_BEGINNING_BYTES = 1 << 23
+"""Pictures may come first."""
+_MODE = re.compile(rb"^(?:[^;\s][^;\n]*)?\bM8[23](?!\d)", re.MULTILINE | re.IGNORECASE)
+"""Not indented, for that may be under a condition."""
+_FEEDS = re.compile(rb"^[ \t]*(?:N\d+[ \t]*)?G0*[0-3](?!\d)[^;\n]*E", re.MULTILINE | re.IGNORECASE)
 _OFFSHOOTS = ("prusa", "bambu")
 """Dialects that may be requested for a Marlin machine."""
 _EXPECTED = ("klipper", "marlin")
@@ -49,6 +56,42 @@ def dialect_for(machine: Machine, name: DialectName | None = None) -> Dialect:
             "machines set-firmware)"
         )
     return own
+
+
+def extruder_mode_awaited(
+    file: BinaryIO, machine: Machine, dialect: Dialect
+) -> tuple[Dialect, list[str]]:
+    """Return a dialect that leaves moves as they are until M82 or M83, if the file needs that.
+
+    With RepRapFirmware a file begins with the mode that config.g has left. A stream could not give
+    that back, and what is fed before the file says a mode is not known.
+
+    Parameters
+    ----------
+    file : binary file
+        Its text; the position is preserved.
+
+    Returns
+    -------
+    dialect, warnings : Dialect, list of str
+        The one given, without a warning, for other firmwares and where the file says a mode first.
+    """
+    if not isinstance(machine.firmware, RepRapFirmware):
+        return dialect, []
+    place = file.tell()
+    file.seek(0)
+    head = file.read(_BEGINNING_BYTES)
+    file.seek(place)
+    mode, feeds = _MODE.search(head), _FEEDS.search(head)
+    if feeds is None or (mode is not None and mode.start() < feeds.start()):
+        return dialect, []
+    line = head.count(b"\n", 0, feeds.start()) + 1
+    warning = (
+        f"line {line} feeds filament before the file says M82 or M83. RepRapFirmware reads E there "
+        "as config.g says, which is not known: moves up to the first of them stay as sliced. Put "
+        "M83 (M82, where E is absolute) at the beginning of the slicer's start code"
+    )
+    return awaiting_extruder_mode(dialect), [warning]
 
 
 def doubts(file: BinaryIO, machine: Machine, name: DialectName | None = None) -> list[str]:

@@ -76,7 +76,9 @@ class PrinterConfig:
         found = self.sections.get(section, {}).get(option)
         if found is None:
             if default is None:
-                raise ModelError(f"{self.name}: [{section}] lacks {option}{self._elsewhere()}")
+                raise ModelError(
+                    f"{self.name}: [{section}] lacks {option}{_elsewhere(self.includes)}"
+                )
             return default
         try:
             value = float(found.value)
@@ -98,14 +100,6 @@ class PrinterConfig:
                 f"{self.name} line {line}: [{section}] {option}: {value:g} must be above 0"
             )
         return value
-
-    def _elsewhere(self) -> str:
-        if not self.includes:
-            return "; is it a printer.cfg?"
-        return (
-            f"; it may stand in {', '.join(self.includes)}, which is not followed: give one file "
-            "that holds all (cat them together)"
-        )
 
 
 class Fact(NamedTuple):
@@ -144,7 +138,8 @@ def parse_printer_config(
     own, includes = _parse(lines, saved=False)
     saved, _ = _parse(lines, saved=True)
     if not own:
-        raise ModelError(f"{name}: no [section] in it; give {wanted}")
+        elsewhere = _elsewhere(includes) if includes else f"; give {wanted}"
+        raise ModelError(f"{name}: no [section] in it{elsewhere}")
     sections = {
         name: saved.get(name, {}) | own.get(name, {}) for name in dict.fromkeys([*own, *saved])
     }
@@ -355,6 +350,16 @@ def _macros(config: PrinterConfig) -> list[Fact]:
     if not macros and config.includes:
         return []
     return [Fact("gcode_macro", "", "firmware.macros", macros)]
+
+
+def _elsewhere(includes: tuple[str, ...]) -> str:
+    """Return where that may stand which a file lacks, and what to do."""
+    if not includes:
+        return "; is it a printer.cfg?"
+    return (
+        f"; it may stand in {', '.join(includes)}, which is not followed: give one file that holds "
+        "all (cat them together)"
+    )
 
 
 def _numbers(

@@ -41,6 +41,8 @@ ASSUMED = {
 """Settings that a stream depends on but M503 does not report, as in most builds."""
 
 _COMMAND = re.compile(r"(M\d{2,3})((?:\s+[A-Z](?:-?\d+(?:\.\d*)?)?)+)\s*(?:;.*)?$")
+_REPRAP = re.compile(r"(?m)^[^;\n]*\b(M566|M584)\b")
+"""Jerk and drivers, which each config.g sets and no Marlin prints."""
 _WORD = re.compile(r"([A-Z])(-?\d+(?:\.\d*)?)?")
 _ROUNDED = (
     "planner.junction_deviation_mm",
@@ -85,10 +87,9 @@ def firmware_section(text: str, name: str) -> dict[str, Any]:
     ------
     ModelError
         If a command that every Marlin prints is missing or lacks a word, if units are inches, or
-        if the printer is a delta or has a shaper that stays on.
+        if the printer runs another firmware, is a delta, or has a shaper that stays on.
     """
-    if re.search(r"(?m)^(?:.*:)?\s*G20\b", text):
-        raise ModelError(f"{name}: the printer works in inches; send G21, then M503 again")
+    _check_text(text, name)
     found = _commands(text)
     _check_printer(found, name)
 
@@ -126,6 +127,19 @@ def firmware_section(text: str, name: str) -> dict[str, Any]:
         "ft_motion": word("M493", "S", 0.0) > 0.0,
         "retraction": _retraction(found, word),
     }
+
+
+def _check_text(text: str, name: str) -> None:
+    """Refuse inches, and RepRapFirmware's answer; `name` is the file's."""
+    if re.search(r"(?m)^(?:.*:)?\s*G20\b", text):
+        raise ModelError(f"{name}: the printer works in inches; send G21, then M503 again")
+    if line := _REPRAP.search(text):
+        raise ModelError(
+            f"{name}: {line[1]} says that these are RepRapFirmware's settings, which answers M503 "
+            "with config.g. Enter its values into a section like "
+            "examples/firmware/reprapfirmware.json (speeds of M203 and M566 divided by 60), and "
+            "give that to machines set-firmware: docs/machines.md, Another firmware"
+        )
 
 
 def _check_printer(found: dict[str, _Words], name: str) -> None:

@@ -130,8 +130,9 @@ def open_text(
     if plate is not None and kind is not Kind.THREEMF:
         raise GcodeError(f"a plate was chosen, but the file is {_NAMES[kind]} and has no plates")
     if kind is Kind.TEXT:
-        if (what := foreign(path)) is not None:
-            raise GcodeError(f"the file is {what}, not G-code; give the file that the slicer wrote")
+        if (found := foreign(path)) is not None:
+            what, remedy = found
+            raise GcodeError(f"the file is {what}, not G-code; {remedy}")
         with path.open("rb") as text:
             yield Container(kind, path, text, None)
         return

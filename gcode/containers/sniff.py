@@ -35,7 +35,10 @@ _FOREIGN = {
     b"7z\xbc\xaf": "a 7z archive",
     b"Rar!": "a RAR archive",
     b"\x7fELF": "a program",
+    b"xgcode ": "FlashForge's .gx (G-code behind a binary header)",
 }
+_SLICER_WROTE = "give the file that the slicer wrote"
+_REMEDIES = {b"xgcode ": "let the slicer save plain G-code (.gcode)"}
 _JSON = re.compile(rb'(\xef\xbb\xbf)?\s*(\{\s*"|\[\s*["\d\[{-])')
 _STL_HEAD_BYTES = 84
 """Header of a binary STL model: 80 arbitrary bytes and the number of facets in four."""
@@ -62,18 +65,19 @@ def kind_of(head: bytes) -> Kind:
     return _MAGICS.get(head[:4], Kind.TEXT)
 
 
-def foreign(path: Path) -> str | None:
-    """Return the kind of a file that is certainly no print file; None for any other."""
+def foreign(path: Path) -> tuple[str, str] | None:
+    """Return what a file is that is certainly no print file, and the remedy; None: it may be."""
     with path.open("rb") as file:
         head = file.read(_STL_HEAD_BYTES)
     size = path.stat().st_size
     if size == 0:
-        return "empty"
+        return "empty", _SLICER_WROTE
     if size == _STL_HEAD_BYTES + _STL_FACET_BYTES * int.from_bytes(head[-4:], "little"):
-        return _FOREIGN[b"solid"]
+        return _FOREIGN[b"solid"], _SLICER_WROTE
     if _JSON.match(head):
-        return "JSON, such as a machine or a report"
-    return next((what for magic, what in _FOREIGN.items() if head.startswith(magic)), None)
+        return "JSON, such as a machine or a report", _SLICER_WROTE
+    magic = next((magic for magic in _FOREIGN if head.startswith(magic)), None)
+    return None if magic is None else (_FOREIGN[magic], _REMEDIES.get(magic, _SLICER_WROTE))
 
 
 def kind_named(path: Path) -> Kind | None:

@@ -177,6 +177,10 @@ class StreamCommands(Protocol):
         """Return lines that set pressure advance while the shaper is off; empty: not needed."""
 
     @property
+    def advance_assumed(self) -> bool:
+        """Whether `advance` sets 0 only because the machine states no pressure advance."""
+
+    @property
     def advance_off(self) -> bytes:
         """Return lines that switch it off again, if the limits of a stream do not."""
 

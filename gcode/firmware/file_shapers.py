@@ -7,10 +7,16 @@ from collections.abc import Iterator
 
 from stillpath.gcode.firmware.line_reader import NUMBERED
 
-__all__ = ["FILE_SETS_SHAPER", "FileShapers"]
+__all__ = ["ADVANCE_LEFT_OFF", "FILE_SETS_SHAPER", "FileShapers"]
 
 FILE_SETS_SHAPER = "The file sets the firmware's input shaper"
 """Beginning of the warning."""
+ADVANCE_LEFT_OFF = (
+    "M572 S0 stands in and behind compensated stretches, since the machine states no "
+    "pressure_advance_s and the file no M572. If config.g, a tool's macro or a filament's config.g "
+    "sets M572, the print lacks pressure advance: put its S into the machine, or M572 into the "
+    "slicer's start code."
+)
 
 _VALUE = re.compile(rb"(?<=[SF=])\s*[-+.\d]+")
 _ADVANCE, _FURTHER_SHAPER = "M572", re.compile(rb"M593(?!\d)", re.IGNORECASE)
@@ -24,18 +30,22 @@ class FileShapers:
     ----------
     lines : dict of bytes to bytes
         The last line of each form.
+    sets_advance : bool
+        A line has set pressure advance.
     """
 
     def __init__(self) -> None:
         self.lines: dict[bytes, bytes] = {}
         self._names: dict[str, tuple[int, int]] = {}
         """Commands that set a shaper: number of the first line, and how many."""
+        self.sets_advance = False
 
     def note(self, line: bytes, number: int) -> None:
         """Record a line that sets the shaper or pressure advance."""
         words = NUMBERED.sub(b"", line).split()
         name = words[0].decode("ascii", "replace").upper() if words else ""
         if name.startswith(_ADVANCE):
+            self.sets_advance = True
             if _FURTHER_SHAPER.search(line) is None:
                 return
         else:

@@ -18,7 +18,7 @@ from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware._writing_kernels import format_moves
 from stillpath.gcode.firmware.base import FirmwareAdapter, changed_limits
 from stillpath.gcode.firmware.encoding import Encoded, to_units
-from stillpath.gcode.firmware.file_shapers import FileShapers
+from stillpath.gcode.firmware.file_shapers import ADVANCE_LEFT_OFF, FileShapers
 from stillpath.gcode.firmware.jumps import jump_lines
 from stillpath.gcode.firmware.line_reader import (
     AXES,
@@ -85,6 +85,7 @@ class StreamWriter:
         """No move came since an object's mark."""
         self._left_off: set[str] = set()
         """Axes whose shaper is not stated, so that it stays off behind a stream."""
+        self._advance_left_off = False
 
     def shaper_warnings(self) -> Iterator[str]:
         """Yield warnings about the firmware's shaper, and about those that the file itself sets."""
@@ -94,6 +95,8 @@ class StreamWriter:
                 f"The firmware's own input shaper{whose} is not known (firmware.shaper in the "
                 "machine): it is switched off and stays off; set it again after the print."
             )
+        if self._advance_left_off and not self._file_shapers.sets_advance:
+            yield ADVANCE_LEFT_OFF
         yield from self._file_shapers.warnings()
 
     def leading(self, piece: Piece, extruder_mm: float) -> bytes:
@@ -481,6 +484,7 @@ class StreamWriter:
             set_again = [self._stream_commands.shaped_axes(line) for line in said]
             self._left_off |= {"X", "Y"}.difference(*set_again)
         lines = (stated or b"") + b"".join(said)
+        self._advance_left_off |= self._stream_commands.advance_assumed
         advance = self._stream_commands.advance(limits)
         return lines if lines.endswith(advance) else lines + advance
 

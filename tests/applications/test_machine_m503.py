@@ -171,6 +171,12 @@ def test_fixed_time_motion_of_both_versions(
         # As Marlin 2.1 prints it for a delta, and Snapmaker's for the J1.
         (M503 + "echo:  M665 L215 R105.2 H330 S200\n", (), ("M665", "delta", "as sliced")),
         (M503.replace("M593 X F", "M593 X P4 F"), (), ("M593 X P", "J1", "as sliced")),
+        # RepRapFirmware's answer is its config.g.
+        (
+            "M92 X80 Y80 Z400 E420:420\nM566 X600 Y600 Z60 E300:300 P1\nM201 X400 Y400 Z25 E300\n",
+            (),
+            ("M566", "RepRapFirmware", "set-firmware"),
+        ),
         (M503, ("--travel", "235"), ("--travel", "235x235x250")),
         (M503, ("--travel", "0:1:235x235x250"), ("--travel", "-4:220")),
         (M503, ("--set", "s_curve"), ("FIELD=VALUE",)),

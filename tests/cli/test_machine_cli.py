@@ -476,6 +476,15 @@ def test_what_is_no_configuration(tmp_path: Path, capsys, content: bytes):
     assert "no [section]" in one_line(capsys)
 
 
+def test_a_configuration_of_nothing_but_includes(tmp_path: Path, capsys):
+    """As Klippain and some vendors have it."""
+    file = tmp_path / "printer.cfg"
+    file.write_text("[include mainsail.cfg]\n[include x400.cfg]\n#*#\n#*# [extruder]\n#*# a = 1\n")
+    assert machines("from-config", file, "--name", "mine") == 2
+    message = one_line(capsys)
+    assert all(word in message for word in ("mainsail.cfg, x400.cfg", "not followed", "cat them"))
+
+
 @pytest.mark.parametrize(
     ("old", "new", "line"),
     [

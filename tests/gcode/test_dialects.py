@@ -533,6 +533,85 @@ def test_meta_commands_are_barriers(read) -> None:
     assert any("expression" in text for text in interpreter.warnings)
 
 
+@pytest.mark.parametrize(
+    ("line", "known"),
+    [
+        ("G10 P0 S{var.t} R{var.t}", 7),
+        ("M109 S{var.t}", 7),
+        ('M593 P"zvd" F{var.f}', 7),
+        ("M204 P{var.a} T{var.a}", 3),
+        ("M207 S{var.l}", 3),
+        ("G10 P0 X{var.x}", 0),
+        ("G92 X{var.x}", 0),
+    ],
+)
+def test_an_expression_leaves_coordinates_alone_that_its_line_does_not_set(
+    line: str, known: int, read
+) -> None:
+    text = f"G28\nT0\nG1 X9 Y9 Z1 F600\n{line}\nG1 X8 Y8\nG1 X7 Y7\n"
+    assert read(text, "reprapfirmware")[0].moves.known[-1] == known
+
+
+@pytest.mark.parametrize("line", ["M572 D0 S{var.k}", "if global.petg\n  M572 D0 S0.06"])
+def test_moves_wait_for_a_pressure_advance_that_is_a_number(line: str, read) -> None:
+    """A stream's filament holds it."""
+    text = f"G28\nT0\n{line}\nG28\nG1 X9 Y9 Z1 F600\nM572 S0.1\nG1 X8 Y8\n"
+    block, interpreter = read(text, "reprapfirmware")
+    assert (block.moves.known & 8).tolist() == [8, 0]
+    assert any("M572 under a condition" in text for text in interpreter.warnings)
+
+
+@pytest.mark.parametrize(
+    ("line", "known"),
+    [
+        ("G28", 3),
+        ("T0", 3),
+        ("M109 S200", 3),
+        ("G10 P0 S200", 3),
+        ("M190 S60", 3),
+        ("G92 X5", 0),
+        ("G10 P0 X5", 0),
+        ("G91", 0),
+    ],
+)
+def test_a_condition_leaves_coordinates_alone_that_its_lines_do_not_set(
+    line: str, known: int, read
+) -> None:
+    """Start codes home where the printer is not homed, and fetch a tool where none is in use."""
+    text = f"G28\nG1 X9 Y9 Z1 F600\nif !move.axes[0].homed\n  {line}\nG1 X8 Y8\nG1 X7 Y7\n"
+    block, _ = read(text, "reprapfirmware")
+    assert block.moves.known.tolist() == [7, 0, known]
+    assert block.events.kind.tolist() == [EventKind.UNKNOWN] * 3
+
+
+@pytest.mark.parametrize(
+    ("before", "line", "known"),
+    [
+        ("M83", "M83", 3),
+        ("M83", "G92 E0", 3),
+        ("M83", "G90", 3),
+        ("M83", "G21", 3),
+        ("M83", "M82", 0),
+        ("M82", "M83", 0),
+        ("M82", "G92 E0", 0),
+        ("M83", "G92 E0 X0", 0),
+        ("G91", "G90", 0),
+    ],
+)
+def test_a_mode_that_is_in_force_needs_no_condition(
+    before: str, line: str, known: int, read
+) -> None:
+    text = f"G28\nG1 X9 Y9 Z1 F600\n{before}\nif true\n  {line}\nG90\nG1 X8 Y8\nG1 X7 Y7\n"
+    assert read(text, "reprapfirmware")[0].moves.known[-1] == known
+
+
+def test_limits_under_a_condition_leave_coordinates_alone(read) -> None:
+    text = "G28\nG1 X9 Y9 Z1 F600\nif true\n  M204 P500 T500\nG1 X8 Y8\nG1 X7 Y7\n"
+    block, interpreter = read(text, "reprapfirmware")
+    assert block.moves.known.tolist() == [7, 0, 3]
+    assert any("M204 under a condition" in text for text in interpreter.warnings)
+
+
 def test_saved_places_are_as_many_as_the_firmware_has(read) -> None:
     text = "".join(f"G60 S{slot}\n" for slot in range(300))
     assert len(read(text, "marlin")[1].state.saved) == 256

@@ -21,6 +21,7 @@ from stillpath.gcode.errors import GcodeError
         (b'{\r\n  "name": "mine"}\n', "JSON"),
         (b'[\n {"t_s": 0.0}\n]\n', "JSON"),
         (b"[1, 2]", "JSON"),
+        (b"xgcode 1.0\n\0\0\0\0\0:\0\0\0\xb08\0\0BM", "FlashForge"),
     ],
 )
 def test_it_says_what_the_file_is(tmp_path: Path, head: bytes, word: str) -> None:

@@ -15,6 +15,7 @@ from stillpath.pipeline.measuring.reference_shaper import cached_shaper
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.simulate import plan_file, simulate_file
 from tests.compensating import compensated
+from tests.fuzz.machines import machine_of
 from tests.gcode.cutting import ender3_with
 from tests.gcode.prints import polygon
 from tests.gcode.states import differences, tagged
@@ -218,3 +219,42 @@ def test_absolute_filament_behind_an_objects_mark(
     assert result.put_back == []
     assert written.count(b"; stillpath: stream on") >= 3
     assert differences(data, written, machine) == []
+
+
+_PURGE = "G28\nG1 X50 Y50 Z.3 F6000\nG92 E0\nG1 X90 E9 F1000\nG1 X90 Y90 E18\nG1 E-1 F2400\n"
+_PART = "G1 E1 F2400\nG1 X60 Y90 E1.5 F3000\nG1 X60 Y60 E1.5\nG1 X90 Y60 E1.5\n"
+
+
+def test_filament_fed_before_the_file_says_a_mode_stays_as_sliced(
+    tmp_path: Path, cache: Path
+) -> None:
+    """RepRapFirmware begins with the mode of config.g, which a stream could not give back."""
+
+    def written(text: str, kind: str = "reprapfirmware") -> tuple[str, bool]:
+        result, found = compensated(text, tmp_path, cache, machine_of(kind), method="shaper:mzv")
+        assert result.pieces > len(result.put_back)
+        return found.decode(), any("says M82 or M83" in w for w in result.warnings)
+
+    text, warned = written(f"{_PURGE}M83\n{_PART}")
+    before, _, after = text.partition("\nM83\n")
+    assert warned
+    assert before.endswith(_PURGE.rstrip())
+    assert "M82" not in before
+    assert "stream on" in after
+    assert written(f"if true\n  M83\n{_PURGE}M83\n{_PART}")[1]
+    for text in (f"M83\n{_PURGE}{_PART}", f"; M83\nG28\nG90 M83\n{_PURGE}{_PART}"):
+        found, warned = written(text)
+        assert not warned
+        assert "stream on" in found.partition("G1 E-1 F2400")[0]
+    found, warned = written(f"{_PURGE}M83\n{_PART}", "marlin")
+    assert not warned
+    assert "stream on" in found.partition("G1 E-1 F2400")[0]
+
+
+def test_a_file_that_says_no_mode_stays_as_sliced(tmp_path: Path, cache: Path) -> None:
+    text = _PURGE + _PART
+    result, found = compensated(
+        text, tmp_path, cache, machine_of("reprapfirmware"), method="shaper:mzv"
+    )
+    assert result.pieces == 0
+    assert text in found.decode()

@@ -129,3 +129,21 @@ def test_several_heads_are_told(tmp_path: Path, cache: Path) -> None:
     assert not told(
         both.replace("T1\n", ";STILLPATH_OFF\nT1\n").replace("T0\n", ";STILLPATH_ON\nT0\n")
     )
+
+
+def test_an_advance_that_neither_machine_nor_file_states_is_told(
+    tmp_path: Path, cache: Path
+) -> None:
+    """A stream switches off what config.g has set, and nothing sets it again."""
+
+    def told(text: str, kind: str = "reprapfirmware", advance_s: float = 0.0) -> bool:
+        machine = machine_of(kind).model_copy(update={"pressure_advance_s": advance_s})
+        result, _ = compensated(text, tmp_path, cache, machine, method="shaper:mzv")
+        return any("pressure_advance_s" in warning for warning in result.warnings)
+
+    silent = _PRINT.replace("M572", ";")
+    assert told(silent)
+    assert told(silent + "M572\n")
+    assert not told(silent.replace("T0\n", "T0\nM572 D0 S0\n", 1))
+    assert not told(silent, advance_s=0.03)
+    assert not told(silent, kind="klipper")

@@ -43,6 +43,7 @@ class KlipperStreamCommands:
     marks = True
     factors_need_axes = False
     advance_off = b""
+    advance_assumed = False
 
     def __init__(self, firmware: Klipper) -> None:
         self._shaper = firmware.shaper

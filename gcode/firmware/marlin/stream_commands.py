@@ -52,6 +52,7 @@ class MarlinStreamCommands:
     marks = False
     factors_need_axes = False
     advance_off = b""
+    advance_assumed = False
     file_shaper_off = b"M593 F0\n"
 
     def __init__(self, firmware: Marlin) -> None:

@@ -55,6 +55,7 @@ class RepRapStreamCommands:
     def __init__(self, firmware: RepRapFirmware, pressure_advance_s: float) -> None:
         shaper = firmware.shaper
         self.advance_off = _advance(0.0)
+        self.advance_assumed = pressure_advance_s == 0.0
         self.shaper_off = b'M593 P"none"\n' + self.advance_off
         self.file_shaper_off = self.shaper_off
         restored = 'M593 P"none"\n'
