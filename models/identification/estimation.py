@@ -90,7 +90,7 @@ def estimate_response(
     report("align", 0.0)
     aligned = aligned or align(log, excitation)
     report("align", 1.0)
-    response = estimate_aligned(log, aligned, excitation, label=label)
+    response = estimate_aligned(log, aligned, label=label)
     _check_followed(response, excitation)
     check_plateau(response, excitation)
     report("estimate", 1.0)
@@ -100,10 +100,10 @@ def estimate_response(
 
 
 def estimate_aligned(
-    log: AccelerationLog, aligned: AlignedLog, excitation: Excitation, *, label: str = ""
+    log: AccelerationLog, aligned: AlignedLog, *, label: str = ""
 ) -> FrequencyResponse:
     """Return the response from a log that is aligned already; its level is not checked."""
-    first, last = excitation.f_start_hz + 1.0, aligned.f_reached_hz - 1.0
+    first, last = aligned.excitation.f_start_hz + 1.0, aligned.f_reached_hz - 1.0
     if last < first + 1.0:
         raise ModelError(
             f"{log.source}: the log reaches {aligned.f_reached_hz:.1f} Hz of the sweep only; "
