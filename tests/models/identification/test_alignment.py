@@ -91,6 +91,18 @@ def test_a_log_without_the_slow_wave_shows_of_which_kind_its_test_is(
         assert aligned.start_s == pytest.approx(100.0, abs=5e-3)
 
 
+@pytest.mark.parametrize("old", [False, True])
+def test_a_log_as_klipper_wrote_it_shows_its_kind_by_its_length(old: bool) -> None:
+    """Where a test begins near the resonance, its phases fit either kind."""
+    test = replace(SHORT, f_start_hz=10.0, sweeping_accel_mm_s2=0.0, f_end_hz=40.0)
+    soft = ModesSpec(
+        modes=(Mode(f_hz=9.0, zeta=0.05, gain=0.1), Mode(f_hz=26.0, zeta=0.12, gain=0.9))
+    )
+    options = {"lead_s": 0.0, "tail_s": 0.0, "rng": np.random.default_rng(3)}
+    log = simulate_log({"x": soft}, replace(test, out_and_back=old), **options)  # type: ignore[arg-type]
+    assert align(log, test).excitation.out_and_back is old
+
+
 @settings(max_examples=12)
 @given(st.floats(0.0, 1e5), st.floats(-0.4, 8.0), st.floats(0.0, 6.0), st.integers(0, 2**32 - 1))
 def test_any_start_is_found(start_s: float, lead_s: float, tail_s: float, seed: int) -> None:
