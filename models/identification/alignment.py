@@ -405,7 +405,8 @@ def _not_found(
         f"{log.source}: the test is not in the log: the greatest correlation with a sweep from "
         f"{excitation.f_start_hz:g} to {excitation.f_end_hz:g} Hz at {excitation.hz_per_s:g} Hz/s "
         f"is {correlation:.2f}; check min_freq, max_freq, hz_per_sec and the Klipper version "
-        "against printer.cfg (a resonance below 16 Hz would hide it too)"
+        "against printer.cfg (a resonance below 16 Hz would hide it too, and Kalico's speed limit "
+        "spoils tests with the slow sweep: leave out its sweeping_period)"
     )
 
 

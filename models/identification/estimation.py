@@ -243,10 +243,15 @@ def _check_followed(response: FrequencyResponse, excitation: Excitation) -> None
     drift_s, per_hz_s = _drift(response.f_hz[coherent], response.response[coherent])
     if abs(drift_s) > _DRIFT_S:
         rate = 1.0 / (1.0 / excitation.hz_per_s + per_hz_s)
+        # Kalico caps the test's speed by printer.cfg's accel_per_hz (resonance_tester.py, 2026-07).
+        kalico = (
+            ". Kalico slows a test down whose ACCEL_PER_HZ is above accel_per_hz in printer.cfg, "
+            "and no option undoes that: set accel_per_hz there, and measure again"
+        )
         raise ModelError(
             f"{response.source}: the log drifts away from a sweep at {excitation.hz_per_s:g} Hz/s, "
             f"by {abs(drift_s):.2g} s over half of it; it looks like hz_per_sec = {rate:.4g}: see "
-            "printer.cfg"
+            f"printer.cfg{kalico if rate < excitation.hz_per_s else ''}"
         )
 
 

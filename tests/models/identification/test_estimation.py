@@ -177,6 +177,16 @@ def test_a_sweep_that_drifts_away_has_its_own_message() -> None:
         estimate_response(measured(MODES, NEW), replace(NEW, hz_per_s=0.998))
 
 
+def test_a_test_that_kalico_slowed_down_is_told_how_to_be_repeated() -> None:
+    """ACCEL_PER_HZ=100 where printer.cfg says 75: Kalico takes 133.6 s for 130.0 s."""
+    slowed, stated = replace(NEW, hz_per_s=0.998), replace(NEW, hz_per_s=1.0)
+    with pytest.raises(ModelError, match=r"Kalico slows .* set accel_per_hz there"):
+        estimate_response(measured(MODES, slowed), stated)
+    with pytest.raises(ModelError, match="drifts away") as faster:
+        estimate_response(measured(MODES, stated), slowed)
+    assert "Kalico" not in str(faster.value)
+
+
 def test_a_soft_axis_with_a_noisy_sensor_is_used_where_it_follows() -> None:
     soft = PairsSpec(poles=(PolePair(f_hz=26.5, zeta=0.2),))
     log = measured(soft, NEW, sensor=Sensor(rate_hz=800.0, noise_mm_s2=300.0))
