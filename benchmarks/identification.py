@@ -51,7 +51,7 @@ from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.files import default_cache_dir
 from stillpath.pipeline.options import Options
 
-OLD = Excitation((1.0, 0.0), f_end_hz=10000 / 75, accel_per_hz_mm_s=75.0, sweeping_accel_mm_s2=0.0)
+OLD = Excitation((1.0, 0.0), 5.0, 10000 / 75, 75.0, sweeping_accel_mm_s2=0.0, out_and_back=True)
 NEW = Excitation((1.0, 0.0))
 TURNED = ((0.36, 0.48, -0.8), (-0.8, 0.6, 0.0), (0.48, 0.64, 0.6))
 THREE = PairsSpec(

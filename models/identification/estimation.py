@@ -90,7 +90,7 @@ def estimate_response(
     report("align", 0.0)
     aligned = aligned or align(log, excitation)
     report("align", 1.0)
-    response = estimate_aligned(log, aligned, excitation, label=label)
+    response = estimate_aligned(log, aligned, label=label)
     _check_followed(response, excitation)
     check_plateau(response, excitation)
     report("estimate", 1.0)
@@ -100,10 +100,10 @@ def estimate_response(
 
 
 def estimate_aligned(
-    log: AccelerationLog, aligned: AlignedLog, excitation: Excitation, *, label: str = ""
+    log: AccelerationLog, aligned: AlignedLog, *, label: str = ""
 ) -> FrequencyResponse:
     """Return the response from a log that is aligned already; its level is not checked."""
-    first, last = excitation.f_start_hz + 1.0, aligned.f_reached_hz - 1.0
+    first, last = aligned.excitation.f_start_hz + 1.0, aligned.f_reached_hz - 1.0
     if last < first + 1.0:
         raise ModelError(
             f"{log.source}: the log reaches {aligned.f_reached_hz:.1f} Hz of the sweep only; "
@@ -243,10 +243,15 @@ def _check_followed(response: FrequencyResponse, excitation: Excitation) -> None
     drift_s, per_hz_s = _drift(response.f_hz[coherent], response.response[coherent])
     if abs(drift_s) > _DRIFT_S:
         rate = 1.0 / (1.0 / excitation.hz_per_s + per_hz_s)
+        # Kalico caps the test's speed by printer.cfg's accel_per_hz (resonance_tester.py, 2026-07).
+        kalico = (
+            ". Kalico slows a test down whose ACCEL_PER_HZ is above accel_per_hz in printer.cfg, "
+            "and no option undoes that: set accel_per_hz there, and measure again"
+        )
         raise ModelError(
             f"{response.source}: the log drifts away from a sweep at {excitation.hz_per_s:g} Hz/s, "
             f"by {abs(drift_s):.2g} s over half of it; it looks like hz_per_sec = {rate:.4g}: see "
-            "printer.cfg"
+            f"printer.cfg{kalico if rate < excitation.hz_per_s else ''}"
         )
 
 

@@ -97,6 +97,12 @@ def regenerate(excitation: Excitation) -> VelocityProfile:
     Each half period is +a, -a for a quarter of the period 1/f each, a = accel_per_hz * f, with
     the sign turned every time; f then grows by hz_per_s/(2 f), so that df/dt = hz_per_s.
 
+    Before 2024-12 (16b4b6b30; Kalico before 2025-01) the quarters are moves of a/2 (1/4f)^2 from
+    the start of the test and back, to alternate sides. The planner does not stop there, only where
+    the motion turns: so velocity peaks at the start of the test, not between turns, and is a
+    quarter of a period away from that of newer versions, at every frequency. The first move out
+    and the last one back begin and end at rest, which takes sqrt(2) times their time.
+
     Raises
     ------
     ModelError
@@ -104,6 +110,8 @@ def regenerate(excitation: Excitation) -> VelocityProfile:
     """
     _check(excitation)
     quarter_s, peak_mm_s = _half_periods(excitation)
+    if excitation.out_and_back:
+        return _about_the_start(quarter_s, peak_mm_s)
     # Velocity is a triangle per half period: 0, peak, 0, -peak, 0, ...
     pulse_t = np.concatenate([[0.0], np.cumsum(np.repeat(quarter_s, 2))])
     pulse_v = np.zeros(len(pulse_t))
@@ -242,6 +250,18 @@ def _half_periods(excitation: Excitation) -> tuple[Array, Array]:
     signs = np.where(np.arange(len(frequencies)) % 2 == 0, 1.0, -1.0)
     # accel_per_hz f for 1/(4 f): the peak velocity is the same in every half period.
     return quarter_s, signs * 0.25 * excitation.accel_per_hz_mm_s
+
+
+def _about_the_start(quarter_s: Array, peak_mm_s: Array) -> VelocityProfile:
+    """Return the velocity of moves out from the start and back, to alternate sides."""
+    # From rest to rest, a move has half of its way for each ramp.
+    edge_s, edge_mm_s = quarter_s[[0, -1]] / np.sqrt(2.0), peak_mm_s[[0, -1]] / np.sqrt(2.0)
+    ramps_s = np.repeat(quarter_s, 2)[1:-1]
+    steps_s = np.concatenate([np.repeat(edge_s[0], 2), ramps_s, np.repeat(edge_s[1], 2)])
+    back_mm_s = np.zeros(len(ramps_s) + 1)
+    back_mm_s[1::2] = -peak_mm_s[:-1]
+    velocity = np.concatenate([[0.0, edge_mm_s[0]], back_mm_s, [-edge_mm_s[1], 0.0]])
+    return VelocityProfile(np.concatenate([[0.0], np.cumsum(steps_s)]), velocity)
 
 
 def _slow_wave(excitation: Excitation, end_s: float) -> tuple[Array, Array]:

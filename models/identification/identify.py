@@ -459,9 +459,8 @@ class _AxisWork:
         """Return the response of a log corrected for dry friction of a motion over the frame."""
         log = self._used[number].measurement
         assert isinstance(log, AccelerationLog)
-        test = excitation_for(log, self._settings)
         sliding, stuck = (
-            estimate_aligned(log, aligned, test, label=response.label)
+            estimate_aligned(log, aligned, label=response.label)
             for aligned in freed(self._aligned[number], motion, friction)
         )
         return replace(better_explained(sliding, stuck), notes=response.notes)
@@ -474,9 +473,9 @@ class _AxisWork:
         for number, response in zip(numbers, responses, strict=True):
             log = self._used[number].measurement
             assert isinstance(log, AccelerationLog)
-            test = excitation_for(log, self._settings)
-            started_s = self._aligned[number].start_s - self._earlier_s
-            out.append(lateness(log, test, started_s, response, plant))
+            aligned = self._aligned[number]
+            started_s = aligned.start_s - self._earlier_s
+            out.append(lateness(log, aligned.excitation, started_s, response, plant))
         return out
 
     def _rubbing(self, plants: PlantSetSpec) -> PlantSetSpec:

@@ -35,7 +35,7 @@ class Excitation:
     """Klipper's resonance test (klippy/extras/resonance_tester.py, 2026-08).
 
     A square wave of acceleration accel_per_hz_mm_s * f whose frequency f rises by hz_per_s; newer
-    versions add a slow square wave (`sweeping_*`).
+    versions add a slow square wave (`sweeping_*`), and begin a quarter of a period later in it.
 
     Attributes
     ----------
@@ -43,6 +43,8 @@ class Excitation:
         Unit vector of the tested axis, (x, y).
     sweeping_accel_mm_s2 : float
         0: no slow square wave.
+    out_and_back : bool
+        Every pulse leads out from the start of the test and back to it, as before 2024-12.
     """
 
     direction: tuple[float, float]
@@ -52,6 +54,7 @@ class Excitation:
     hz_per_s: float = 1.0
     sweeping_accel_mm_s2: float = 400.0
     sweeping_period_s: float = 1.2
+    out_and_back: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -18,7 +18,7 @@ from stillpath.simulation.printers.machines import Printer
 
 __all__ = ["NEW_TEST", "OLD_TEST", "Accelerometer", "Record", "drawn_sensor", "run_test"]
 
-OLD_TEST = Excitation((1.0, 0.0), 5.0, 133.33, 75.0, 1.0, 0.0)
+OLD_TEST = Excitation((1.0, 0.0), 5.0, 133.33, 75.0, 1.0, 0.0, out_and_back=True)
 NEW_TEST = Excitation((1.0, 0.0))
 _GRAVITY_MM_S2 = 9806.65
 _DWELL_S = 0.5

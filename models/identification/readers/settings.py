@@ -288,7 +288,7 @@ def _resolved(measurement: AccelerationLog | Spectrum, settings: ReadSettings) -
             f"{measurement.source}: the test would run from {values['f_start_hz']:g} to "
             f"{values['f_end_hz']:g} Hz; give both min_freq and max_freq"
         )
-    excitation = Excitation(direction=defaults.direction, **values)
+    excitation = Excitation(defaults.direction, out_and_back=False, **values)
     if assumed:
         era = _era(made, settings, shows=_kind(measurement) if by_file else "")
         found.append(f"assumed {', '.join(assumed)}: the defaults of Klipper {era}")

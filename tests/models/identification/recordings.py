@@ -43,7 +43,7 @@ __all__ = [
 ]
 
 SWEEPING = Excitation((1.0, 0.0))
-LEGACY = Excitation((1.0, 0.0), 5.0, 10_000 / 75, 75.0, 1.0, 0.0, 0.0)
+LEGACY = Excitation((1.0, 0.0), 5.0, 10_000 / 75, 75.0, 1.0, 0.0, out_and_back=True)
 # Half a minute at 500 Hz: little, and still enough for one mode.
 QUICK = Excitation((1.0, 0.0), 5.0, 65.0, 60.0, 2.0, 0.0)
 QUICK_SENSOR = Sensor(rate_hz=500.0, noise_mm_s2=20.0)

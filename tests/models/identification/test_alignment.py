@@ -19,7 +19,7 @@ from stillpath.models.plants import Mode, ModesSpec
 
 NEW = Excitation((1.0, 0.0))
 NEW_Y = Excitation((0.0, 1.0))
-LEGACY = Excitation((1.0, 0.0), 5.0, 10_000 / 75, 75.0, 1.0, 0.0, 0.0)
+LEGACY = Excitation((1.0, 0.0), 5.0, 10_000 / 75, 75.0, 1.0, 0.0, out_and_back=True)
 SHORT = Excitation((1.0, 0.0), 5.0, 25.0, 60.0, 1.0)
 PLANT = ModesSpec(modes=(Mode(f_hz=47, zeta=0.035, gain=0.8), Mode(f_hz=95, zeta=0.06, gain=0.2)))
 PLANTS = {"x": PLANT, "y": PLANT}
@@ -71,6 +71,36 @@ def test_a_log_that_begins_with_the_test_has_the_rest_before_it() -> None:
     assert not cut.command_mm_s2[:still].any()
     begun = int(0.55 * cut.rate_hz)
     assert np.abs(cut.command_mm_s2[still:begun]).max() > 100.0
+
+
+@pytest.mark.parametrize("old", [False, True])
+@pytest.mark.parametrize("frame_hz", [7.0, 10.0, 13.0])
+def test_a_log_without_the_slow_wave_shows_of_which_kind_its_test_is(
+    frame_hz: float, old: bool
+) -> None:
+    """Klipper's before 2024-12, or that of Kalico and of sweeping_period 0."""
+    test = replace(SHORT, sweeping_accel_mm_s2=0.0, f_end_hz=40.0)
+    shaken = ModesSpec(
+        modes=(Mode(f_hz=frame_hz, zeta=0.05, gain=0.06), Mode(f_hz=30.0, zeta=0.1, gain=0.94))
+    )
+    rng = np.random.default_rng(3)
+    log = simulate_log({"x": shaken}, replace(test, out_and_back=old), rng=rng)
+    for asked in (False, True):
+        aligned = align(log, replace(test, out_and_back=asked))
+        assert aligned.excitation == replace(test, out_and_back=old)
+        assert aligned.start_s == pytest.approx(100.0, abs=5e-3)
+
+
+@pytest.mark.parametrize("old", [False, True])
+def test_a_log_as_klipper_wrote_it_shows_its_kind_by_its_length(old: bool) -> None:
+    """Where a test begins near the resonance, its phases fit either kind."""
+    test = replace(SHORT, f_start_hz=10.0, sweeping_accel_mm_s2=0.0, f_end_hz=40.0)
+    soft = ModesSpec(
+        modes=(Mode(f_hz=9.0, zeta=0.05, gain=0.1), Mode(f_hz=26.0, zeta=0.12, gain=0.9))
+    )
+    options = {"lead_s": 0.0, "tail_s": 0.0, "rng": np.random.default_rng(3)}
+    log = simulate_log({"x": soft}, replace(test, out_and_back=old), **options)  # type: ignore[arg-type]
+    assert align(log, test).excitation.out_and_back is old
 
 
 @settings(max_examples=12)

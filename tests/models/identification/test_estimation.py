@@ -38,7 +38,7 @@ from stillpath.models.plants import (
 )
 
 NEW = Excitation((1.0, 0.0))
-LEGACY = Excitation((1.0, 0.0), 5.0, 10_000 / 75, 75.0, 1.0, 0.0, 0.0)
+LEGACY = Excitation((1.0, 0.0), 5.0, 10_000 / 75, 75.0, 1.0, 0.0, out_and_back=True)
 SHORT = Excitation((1.0, 0.0), 5.0, 25.0, 60.0, 1.0)
 TURNED = ((2 / 3, -1 / 3, 2 / 3), (2 / 3, 2 / 3, -1 / 3), (-1 / 3, 2 / 3, 2 / 3))
 MODES = ModesSpec(
@@ -89,7 +89,7 @@ def test_the_response_is_within_its_tolerances(
     for excitation, plant in tests:
         log = measured(plant, excitation, sensor=sensor, start_s=99.7, lead_s=0.4)
         aligned = align(log, excitation)
-        found = estimate_aligned(log, aligned, excitation)
+        found = estimate_aligned(log, aligned)
         assert found.f_hz[0] == 6.0
         assert found.f_hz[-1] == pytest.approx(excitation.f_end_hz - 1, abs=0.25)
         assert found.coherence.min() > 0.95
@@ -105,7 +105,7 @@ def test_the_standard_deviation_is_that_of_the_errors() -> None:
         sensor = Sensor(rate_hz=1600.0, noise_mm_s2=200.0, lsb_mm_s2=0.0)
         log = measured(MODES, NEW, seed, sensor=sensor)
         aligned = align(log, NEW)
-        found = estimate_aligned(log, aligned, NEW)
+        found = estimate_aligned(log, aligned)
         error = errors(found, MODES, aligned.start_s - 100.0)
         ratios.append(error * np.abs(frequency_response(MODES, found.f_hz)) / found.sd)
     # Complex Gaussian errors: mean square 1, median sqrt(log 2).
@@ -175,6 +175,16 @@ def test_a_sweep_that_drifts_away_has_its_own_message() -> None:
     like = r"drifts away from .* like hz_per_sec = (1|0\.999\d|1\.000\d):"
     with pytest.raises(ModelError, match=like):
         estimate_response(measured(MODES, NEW), replace(NEW, hz_per_s=0.998))
+
+
+def test_a_test_that_kalico_slowed_down_is_told_how_to_be_repeated() -> None:
+    """ACCEL_PER_HZ=100 where printer.cfg says 75: Kalico takes 133.6 s for 130.0 s."""
+    slowed, stated = replace(NEW, hz_per_s=0.998), replace(NEW, hz_per_s=1.0)
+    with pytest.raises(ModelError, match=r"Kalico slows .* set accel_per_hz there"):
+        estimate_response(measured(MODES, slowed), stated)
+    with pytest.raises(ModelError, match="drifts away") as faster:
+        estimate_response(measured(MODES, stated), slowed)
+    assert "Kalico" not in str(faster.value)
 
 
 def test_a_soft_axis_with_a_noisy_sensor_is_used_where_it_follows() -> None:

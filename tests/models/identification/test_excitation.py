@@ -33,6 +33,20 @@ def test_the_legacy_sweep_has_its_published_figures() -> None:
     assert profile.travel_mm() == pytest.approx((0.0, 18.75 / 2 / 10), abs=1e-9)
 
 
+def test_the_sweep_before_2024_12_is_as_its_klipper_planned_it() -> None:
+    """Recorded from klippy/toolhead.py and resonance_tester.py of 2024-02-17 (72b301a28)."""
+    profile = regenerate(replace(LEGACY, out_and_back=True))
+    first_s = [0.0, 0.0353553391, 0.0707106781, 0.120710678, 0.169730286, 0.218749894, 0.266844952]
+    last_s = [128.35354318, 128.35541819, 128.35674402, 128.35806985]
+    np.testing.assert_allclose(profile.time_s[:7], first_s, atol=2e-9)
+    np.testing.assert_allclose(profile.time_s[-4:], last_s, atol=2e-8)
+    first_mm_s = [0.0, 13.2582521, 0.0, -18.75, 0.0, 18.75, 0.0]
+    last_mm_s = [-18.75, 0.0, 13.2582521, 0.0]
+    np.testing.assert_allclose(profile.velocity_mm_s[:7], first_mm_s, atol=1e-7)
+    np.testing.assert_allclose(profile.velocity_mm_s[-4:], last_mm_s, atol=1e-7)
+    assert profile.travel_mm() == pytest.approx((-0.4595588, 0.46875), abs=1e-6)
+
+
 def test_the_new_sweep_has_its_published_figures() -> None:
     profile = regenerate(NEW)
     assert np.abs(profile.velocity_mm_s).max() == pytest.approx(135.0, abs=0.5)

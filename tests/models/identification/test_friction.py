@@ -55,7 +55,7 @@ def test_it_is_told_by_the_log() -> None:
     assert found.held_mm == pytest.approx(held_mm(printer, 0), rel=0.3)
     # What is left follows the command better.
     log, aligned, response = read[0]
-    again = estimate_aligned(log, freed(aligned, response, found)[0], NEW_TEST)
+    again = estimate_aligned(log, freed(aligned, response, found)[0])
     low = (response.f_hz > 8) & (response.f_hz < 25)
     assert np.mean(1 - again.coherence[low]) < 0.9 * np.mean(1 - response.coherence[low])
 
@@ -93,7 +93,7 @@ def test_guides_that_stick_above_the_resonance_act_as_springs(seed: int, test: E
     printer = draw("bed slinger", seed)
     ((log, aligned, response),) = logs(rubbing(printer, 8.0), test)
     found = dry_friction([aligned], [[response]])
-    sliding, stuck = (estimate_aligned(log, one, test) for one in freed(aligned, response, found))
+    sliding, stuck = (estimate_aligned(log, one) for one in freed(aligned, response, found))
     both = better_explained(sliding, stuck)
     sticks = both.response != sliding.response
     resonance_hz = sliding.f_hz[np.argmax(np.abs(sliding.response))]

@@ -373,6 +373,16 @@ def loaded(kg: float, f_hz: float = 35.0, zeta: float = 0.08, m0_kg: float = 0.8
     return one_mode(f_hz * factor, zeta * factor)
 
 
+def test_raw_logs_of_a_klipper_before_2024_12() -> None:
+    """Its pulses lead out and back, a quarter of a period away from those of newer versions."""
+    old = replace(QUICK, out_and_back=True)
+    found = one(quick_raw("x", one_mode(42.0, 0.06), test=old))
+    assert main_mode(found) == pytest.approx(42.0, rel=0.01)
+    assert found.plants.provenance is not None
+    assert found.plants.provenance.kind == "raw log"
+    assert not [w for w in found.warnings if "phase" in w]
+
+
 def test_moving_mass_from_two_raw_logs() -> None:
     found = one(quick_raw("y", loaded(0.0)), quick_raw("y", loaded(0.5), condition="+500g"))
     mass = mass_of(found)
