@@ -221,9 +221,9 @@ def test_words_set_the_limits_that_they_name() -> None:
         RepRapLimits.of(firmware(), 0.0), jerk_x_mm_s=4.0, jerk_policy=1.0, min_speed_mm_s=0.3
     )
     stream_commands = RepRapStreamCommands(firmware(), ADVANCE_S)
-    # A limit that was written as 0 would leave that of the stream in force.
-    tiny = replace(own, accel_e_mm_s2=1e-9)
-    for limits in (own, tiny, stream_limits(firmware(), CommandLimits())):
+    # The least that the firmware takes.
+    least = replace(own, accel_e_mm_s2=0.1, speed_z_mm_s=0.3)
+    for limits in (own, least, stream_limits(firmware(), CommandLimits())):
         reader = Interpreter(machine_of(firmware(), advance_s=0.03))
         blocks = [*reader.push(stream_commands.limits(limits) + b"G1 X1 F600\n"), *reader.flush()]
         read = blocks[0].limits[blocks[0].moves.limits_id[0]]
