@@ -195,9 +195,11 @@ def test_a_queue_that_cannot_be_kept_filled_is_refused() -> None:
         work.compensate(piece)
 
 
-def test_a_dense_stream_is_thinned_out_for_a_short_queue() -> None:
+@pytest.mark.parametrize("least_s", [0.025, 0.0])
+def test_a_dense_stream_is_thinned_out_for_a_short_queue(least_s: float) -> None:
     # 7 moves must last 27 ms: none of them may be the 1 ms that a corner would like.
-    _, short = compensated(HEAD + BODIES["corners"], machine_of(firmware(ring_length=16)))
+    machine = machine_of(firmware(ring_length=16, prepare_least_s=least_s))
+    _, short = compensated(HEAD + BODIES["corners"], machine)
     phases = short.encoded.phases
     total = np.cumsum(np.append(0.0, phases.lasts_s))
     assert np.min(total[7:] - total[:-7]) >= 27e-3

@@ -136,9 +136,14 @@ def test_moves_that_come_too_fast_make_the_motion_stutter() -> None:
     # .5 ms each: when half the ring is frozen, the next one is frozen 9.5 ms before its time and
     # is put off until 25 ms after that.
     limits = replace(LIMITS, accel_x_mm_s2=1e6, travel_accel_mm_s2=1e6)
-    phases = plan(path([(0.05 * k, 0) for k in range(200)], 100.0), limits)
+    phases = plan(path([(0.05 * k, 0) for k in range(400)], 100.0), limits)
     pauses = np.diff(phases.t_s) - phases.lasts_s[:-1]
     assert pauses.max() == pytest.approx(0.025 - 0.0095, abs=1e-3)
+    # The firmware's own code on a PC paused for .305 s, before 3.6.0-beta.2 not at all.
+    assert pauses.sum() == pytest.approx(0.305, rel=0.05)
+    older = FIRMWARE.model_copy(update={"prepare_least_s": 0.0})
+    phases = plan(path([(0.05 * k, 0) for k in range(400)], 100.0), limits, older)
+    assert phases.t_s[-1] + phases.lasts_s[-1] == pytest.approx(0.1996013, abs=CLOCK_S)
     # 2 ms each: half a ring lasts 38 ms.
     calm = plan(path([(0.2 * k, 0) for k in range(200)], 100.0), limits)
     assert np.max(np.diff(calm.t_s) - calm.lasts_s[:-1]) < 1e-9
