@@ -73,7 +73,8 @@ class RepRapFirmware(FirmwareFacts):
     prepare_ahead_s: Positive = 0.05
     """How long before its start a move is frozen; what comes later cannot change it."""
     prepare_least_s: NonNegative = 0.025
-    """A move that is frozen later than this before its start is delayed: the motion stutters."""
+    """A move that is frozen later than this before its start is delayed: the motion stutters. Say 0
+    for 3.5 and older (before 3.6.0-beta.2), where it follows without a pause."""
     arc_deviation_mm: Positive = 0.005
     arc_least_mm: Positive = 0.02
     arc_segments_per_s: Positive = 200.0

@@ -328,6 +328,24 @@ def test_limits(read) -> None:
     assert block.limits[block.events.limits_id[2]].jerk_x_mm_s == 10
 
 
+def test_reprapfirmware_takes_no_limit_below_its_least(read) -> None:
+    """As its own code did on a PC (3.6-dev, 2024-10): Z .2 mm in .4025 s after the first line."""
+    # PrusaSlicer's "Marlin" means mm/s, which this firmware reads as mm/min: .2 mm/s. M203 I is .5.
+    lines = ["M203 X200 Z12 E120", "M203 I6", "M203 Z12", "M203 Z0 I3", "M203 X-5", "M203 Z12"]
+    block, _ = read("\n".join(lines) + "\n", "reprapfirmware")
+    found = [block.limits[k] for k in block.events.limits_id]
+    assert [one.speed_z_mm_s for one in found] == pytest.approx([0.5, 0.5, 0.2, 0.05, 0.05, 0.2])
+    assert [one.min_speed_mm_s for one in found] == pytest.approx([0.5, 0.1, 0.1, 0.05, 0.05, 0.05])
+    assert found[0].speed_x_mm_s == pytest.approx(200 / 60)
+    assert found[0].speed_e_mm_s == 2.0
+    assert found[4].speed_x_mm_s == pytest.approx(0.05)
+    block, _ = read("M201 X0 Y300\nM204 P0 T900\nM203 I0\n", "reprapfirmware")
+    after = block.limits[block.events.limits_id[-1]]
+    assert (after.accel_x_mm_s2, after.accel_y_mm_s2) == (0.1, 300)
+    assert (after.print_accel_mm_s2, after.travel_accel_mm_s2) == (0.1, 900)
+    assert after.min_speed_mm_s == 0.01
+
+
 @pytest.mark.parametrize(
     ("line", "field"),
     [

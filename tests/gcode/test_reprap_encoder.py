@@ -195,9 +195,11 @@ def test_a_queue_that_cannot_be_kept_filled_is_refused() -> None:
         work.compensate(piece)
 
 
-def test_a_dense_stream_is_thinned_out_for_a_short_queue() -> None:
+@pytest.mark.parametrize("least_s", [0.025, 0.0])
+def test_a_dense_stream_is_thinned_out_for_a_short_queue(least_s: float) -> None:
     # 7 moves must last 27 ms: none of them may be the 1 ms that a corner would like.
-    _, short = compensated(HEAD + BODIES["corners"], machine_of(firmware(ring_length=16)))
+    machine = machine_of(firmware(ring_length=16, prepare_least_s=least_s))
+    _, short = compensated(HEAD + BODIES["corners"], machine)
     phases = short.encoded.phases
     total = np.cumsum(np.append(0.0, phases.lasts_s))
     assert np.min(total[7:] - total[:-7]) >= 27e-3
@@ -221,9 +223,9 @@ def test_words_set_the_limits_that_they_name() -> None:
         RepRapLimits.of(firmware(), 0.0), jerk_x_mm_s=4.0, jerk_policy=1.0, min_speed_mm_s=0.3
     )
     stream_commands = RepRapStreamCommands(firmware(), ADVANCE_S)
-    # A limit that was written as 0 would leave that of the stream in force.
-    tiny = replace(own, accel_e_mm_s2=1e-9)
-    for limits in (own, tiny, stream_limits(firmware(), CommandLimits())):
+    # The least that the firmware takes.
+    least = replace(own, accel_e_mm_s2=0.1, speed_z_mm_s=0.3)
+    for limits in (own, least, stream_limits(firmware(), CommandLimits())):
         reader = Interpreter(machine_of(firmware(), advance_s=0.03))
         blocks = [*reader.push(stream_commands.limits(limits) + b"G1 X1 F600\n"), *reader.flush()]
         read = blocks[0].limits[blocks[0].moves.limits_id[0]]

@@ -117,13 +117,33 @@ def test_the_ring_limits_the_speed_of_short_moves() -> None:
     assert phases.end_mm_s[100:150].max() > 1.9 * middle.max()
 
 
+def test_a_long_move_soon_after_a_standstill_ends_at_rest() -> None:
+    """As the firmware's own code did on a PC (3.6-dev, 2024-10), to the clock.
+
+    The ring takes no third move because the second one lasts more than 2 s, and when it starts, it
+    freezes both: the first lasts less than 50 ms, and the wait before it does not count.
+    """
+    places = [(0, 0), (0.6, 0), (60, 0), (60.8, 0.6), (90, 0.6)]
+    phases = plan(path(places, 26.0))
+    assert phases.lasts_s / CLOCK_S == pytest.approx([27_058, 1_723_212, 36_658, 852_072], abs=0.1)
+    assert phases.end_mm_s == pytest.approx([26.0, 0.0, 25.0, 0.0], abs=1e-3)
+    # Where the first lasts longer, the second is frozen later, when the ring holds the third.
+    phases = plan(path([(-2.0, 0), *places[1:]], 26.0))
+    assert phases.end_mm_s == pytest.approx([26.0, 25.0, 25.0, 0.0], abs=1e-3)
+
+
 def test_moves_that_come_too_fast_make_the_motion_stutter() -> None:
     # .5 ms each: when half the ring is frozen, the next one is frozen 9.5 ms before its time and
     # is put off until 25 ms after that.
     limits = replace(LIMITS, accel_x_mm_s2=1e6, travel_accel_mm_s2=1e6)
-    phases = plan(path([(0.05 * k, 0) for k in range(200)], 100.0), limits)
+    phases = plan(path([(0.05 * k, 0) for k in range(400)], 100.0), limits)
     pauses = np.diff(phases.t_s) - phases.lasts_s[:-1]
     assert pauses.max() == pytest.approx(0.025 - 0.0095, abs=1e-3)
+    # The firmware's own code on a PC paused for .305 s, before 3.6.0-beta.2 not at all.
+    assert pauses.sum() == pytest.approx(0.305, rel=0.05)
+    older = FIRMWARE.model_copy(update={"prepare_least_s": 0.0})
+    phases = plan(path([(0.05 * k, 0) for k in range(400)], 100.0), limits, older)
+    assert phases.t_s[-1] + phases.lasts_s[-1] == pytest.approx(0.1996013, abs=CLOCK_S)
     # 2 ms each: half a ring lasts 38 ms.
     calm = plan(path([(0.2 * k, 0) for k in range(200)], 100.0), limits)
     assert np.max(np.diff(calm.t_s) - calm.lasts_s[:-1]) < 1e-9
@@ -310,11 +330,12 @@ def plan_plainly(moves: Moves, limits: RepRapLimits, firmware: RepRapFirmware) -
                     new.enter = last.leave
         while open_moves and 2 * len(frozen) < ring:
             lead = end - now
+            left = sum(until - max(since, now) for since, until in frozen)
             # On the edge of being late the kernels' whole clocks may decide otherwise.
             assume(abs(lead - firmware.prepare_least_s) > 1e-5)
             if not frozen:
                 start = now + firmware.prepare_ahead_s
-            elif lead > firmware.prepare_ahead_s + 1e-9:
+            elif left > firmware.prepare_ahead_s + 1e-9:
                 break
             elif lead >= firmware.prepare_least_s:
                 start = end
@@ -326,7 +347,12 @@ def plan_plainly(moves: Moves, limits: RepRapLimits, firmware: RepRapFirmware) -
             starts.append(start)
         upcoming = [frozen[0][1]]
         if open_moves and 2 * len(frozen) < ring:
-            upcoming.append(end - firmware.prepare_ahead_s)
+            left = firmware.prepare_ahead_s
+            for since, until in reversed(frozen):
+                if until - since >= left:
+                    upcoming.append(until - left)
+                    break
+                left -= until - since
         now = max(now, min(upcoming))
     return np.array([*starts, end])
 

@@ -191,13 +191,15 @@ def run(
                 break
             _enter(queue, state)
         held = int(state[S_HELD])
+        freezes = now
         while frozen < held and 2 * (frozen - over) < ring:
             row = queue[frozen]
             lead = state[S_FROZEN_END] - now
+            freezes = _freezes(queue, over, frozen, ahead)
+            if freezes > now + max(_EPS_S, _ROUNDING * now):  # else `now` might never come there
+                break
             if frozen == over:
                 begins = now + ahead
-            elif lead > ahead + max(_EPS_S, _ROUNDING * now):  # else `now` might never come there
-                break
             elif lead >= least:
                 begins = state[S_FROZEN_END]
             else:
@@ -215,8 +217,22 @@ def run(
         if over < frozen:
             following = queue[over, Q_BEGINS] + queue[over, Q_LASTS]
         if frozen < held and 2 * (frozen - over) < ring:
-            following = min(following, state[S_FROZEN_END] - ahead)
+            following = min(following, freezes)
         state[S_NOW] = max(now, following)
+
+
+@kernel
+def _freezes(queue: Any, over: int, frozen: int, ahead: float) -> float:
+    """Return when the next move is frozen: when the frozen ones have only `ahead` still to run.
+
+    Waiting does not count: after a standstill, moves of that duration are frozen at once.
+    """
+    left = ahead
+    for m in range(frozen - 1, over - 1, -1):
+        if queue[m, Q_LASTS] >= left:
+            return float(queue[m, Q_BEGINS] + queue[m, Q_LASTS] - left)
+        left -= queue[m, Q_LASTS]
+    return -np.inf
 
 
 @kernel

@@ -44,23 +44,33 @@ __all__ = [
 
 _MODES = (at.I_ABS_XYZ, at.I_ABS_E, at.I_PLANE)
 _MOST_PUSHED = 10
+_LEAST_ACCEL_MM_S2, _LEAST_SPEED_MM_S = 0.1, 0.01
+"""What the firmware takes a lower value for: MinimumAcceleration and AbsoluteMinFeedrate."""
 
 
 def accelerations(state: MachineState, command: Command) -> int:
     """M201, in mm/s2."""
     given = state.numbers(command, "XYZE")
-    values = {f"accel_{k.lower()}_mm_s2": v for k, v in given.items() if v > 0.0}
+    values = {f"accel_{k.lower()}_mm_s2": max(v, _LEAST_ACCEL_MM_S2) for k, v in given.items()}
     return state.set_limits(command, values, kind=state.limits_kind(command, "XYZE"))
 
 
 def speeds(state: MachineState, command: Command) -> int:
-    """M203, in mm/min, with S1 in mm/s; I is the slowest that a move may be."""
+    """M203, in mm/min, with S1 in mm/s; I is the slowest that a move may be.
+
+    No limit is taken lower than that, I of the same line first.
+    """
     given = state.numbers(command, "XYZEIS")
     unit = 1.0 if given.pop("S", 0.0) == 1.0 else 1.0 / 60.0
-    values = {f"speed_{k.lower()}_mm_s": v * unit for k, v in given.items() if k != "I" and v > 0.0}
-    if given.get("I", 0.0) > 0.0:
-        values["min_speed_mm_s"] = given["I"] * unit
-    return state.set_limits(command, values, kind=state.limits_kind(command, "XYZEIS"))
+    values = {}
+    least = state.limit("min_speed_mm_s")
+    own = "I" in given
+    if own:
+        least = values["min_speed_mm_s"] = max(given.pop("I") * unit, _LEAST_SPEED_MM_S)
+    values |= {f"speed_{k.lower()}_mm_s": max(v * unit, least) for k, v in given.items()}
+    # Without I it depends on the I before, so it is not remembered.
+    kind = state.limits_kind(command, "XYZEIS")
+    return state.set_limits(command, values, remember=own, kind=kind)
 
 
 def acceleration(state: MachineState, command: Command) -> int:
@@ -72,8 +82,8 @@ def acceleration(state: MachineState, command: Command) -> int:
         ("P", ("print_accel_mm_s2",)),
         ("T", ("travel_accel_mm_s2",)),
     ):
-        if given.get(letter, 0.0) > 0.0:
-            values.update(dict.fromkeys(names, given[letter]))
+        if letter in given:
+            values.update(dict.fromkeys(names, max(given[letter], _LEAST_ACCEL_MM_S2)))
     return state.set_limits(command, values)
 
 

@@ -56,6 +56,8 @@ _DIAGONAL = 1.5
 """Ratio of a CoreXY motor's speed to the path's, and of the changes of Z's direction."""
 _PASSES = 4
 _EXACT_S = 2e-6
+_LEAST_S = 0.025
+"""As `prepare_least_s` of today's firmware; with an older one, too, lines must be read in time."""
 _POLL_S = 2e-3
 """The firmware checks every 2 ms whether moves are to be frozen."""
 _SPARSE = 1.3
@@ -139,7 +141,7 @@ class RepRapEncoder:
         self._firmware = firmware
         self._kinematics = kinematics
         self._half_ring = firmware.ring_length // 2 - 1
-        self._half_ring_s = firmware.prepare_least_s + _POLL_S
+        self._half_ring_s = max(firmware.prepare_least_s, _LEAST_S) + _POLL_S
         """Least duration of that many moves, so that the firmware freezes the next one in time."""
         self._limits = limits
         per_mm = np.array([drive.steps_per_mm for drive in firmware.drives])

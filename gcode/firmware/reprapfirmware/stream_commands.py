@@ -130,7 +130,7 @@ def _words(
 
 
 def _number(value: float) -> str:
-    # A limit that rounds to 0 would not be taken.
+    # What rounds to 0 would be taken for the firmware's least.
     decimals = 6 if abs(value) >= 1e-3 else 15
     text = f"{value:.{decimals}f}".rstrip("0").rstrip(".")
     return text or "0"
