@@ -1,8 +1,8 @@
 """Plans against the steps of Marlin itself: planner.cpp and stepper.cpp, run with a virtual timer.
 
-Release 2.1.2.5, 80 steps per mm in X and Y and 400 in Z, a timer of 2 MHz, a queue of 16. Points
-are in steps; a time is that from a move's begin to its last step. The board counts E and computes
-in single precision, so rates may differ by a step per second.
+Release 2.1.2.5, and 2.0.8 where it says so, 80 steps per mm in X and Y and 400 in Z, a timer of
+2 MHz, a queue of 16. Points are in steps; a time is that from a move's begin to its last step. The
+board counts E and computes in single precision, so rates may differ by a step per second.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ FIRMWARE = Marlin(steps_per_mm=PerAxis(x=80.0, y=80.0, z=400.0, e=93.0))
 
 
 def lasts_ms(
-    steps: Any, speed_mm_s: float, firmware: Marlin = FIRMWARE, **limits: float
+    steps: Any, speed_mm_s: Any, firmware: Marlin = FIRMWARE, **limits: float
 ) -> NDArray[np.float64]:
     scale = firmware.steps_per_mm
     points = np.asarray(steps, np.float64) / [scale.x, scale.y, scale.z]
@@ -60,3 +60,24 @@ def test_a_step_of_z_along_the_way() -> None:
     limits |= {"feedrate_z_mm_s": 15.0, "junction_deviation_mm": 0.01}
     found = lasts_ms(np.column_stack([20 * k, 17 * k, z]), 60.0, **limits)
     assert found == pytest.approx([14.0135, 5.479, *21 * [5.46], 7.5345], abs=0.002)
+
+
+RAMPS = {
+    ("2.0", False): [64.166, 4.9675, 9.996, 4.7635, 18.75, 3.1265, 20.193, 50.0, 8.8615, 42.3595],
+    ("2.0", True): [64.166, 4.8935, 9.996, 4.68, 18.75, 3.1365, 18.498, 50.0, 8.685, 41.9325],
+    ("2.1", False): [57.083, 4.144, 9.996, 4.272, 18.75, 2.8855, 19.535, 50.0, 6.701, 42.3595],
+    ("2.1", True): [57.083, 4.1535, 9.996, 4.2755, 18.75, 2.881, 18.2955, 50.0, 6.5535, 41.9325],
+}
+"""Times of ten moves along X in 2.0.8 and 2.1.2.5, without and with S_CURVE_ACCELERATION."""
+
+
+@pytest.mark.parametrize(("variant", "s_curve"), RAMPS)
+def test_moves_that_speed_up_and_slow_down(variant: Any, s_curve: bool) -> None:
+    """In 2.0 the second step is as slow as the first: until 2026-11 it was planned as in 2.1."""
+    steps = np.cumsum([0, 40, 6, 12, 8, 30, 6, 80, 20, 10, 100])
+    speed = np.array([10.0, 40.0, 15.0, 60.0, 20.0, 80.0, 100.0, 5.0, 50.0, 30.0])
+    limits = {f"{kind}_accel_mm_s2": 5000.0 for kind in ("print", "travel")}
+    limits |= {"accel_x_mm_s2": 5000.0, "junction_deviation_mm": 0.05}
+    firmware = FIRMWARE.model_copy(update={"variant": variant, "s_curve": s_curve})
+    found = lasts_ms(np.column_stack([steps, 0 * steps, 0 * steps]), speed, firmware, **limits)
+    assert found == pytest.approx(RAMPS[variant, s_curve], abs=0.01)

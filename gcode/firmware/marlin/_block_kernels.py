@@ -60,7 +60,8 @@ C_FAMILY, C_CORE, C_CLASSIC_JERK, C_SMALL_SEGMENTS = 4, 5, 6, 7
 C_MIN_STEPS, C_QUEUE, C_SLOWDOWN, C_MIN_SPEED, C_ADVANCE = 8, 9, 10, 11, 12
 C_TIMER_HZ, C_SMOOTHING_HZ, C_MIN_RATE, C_S_CURVE = 13, 14, 15, 16
 C_RESTS_APART = 17  # short moves are not joined with moves of Z or the extruder alone
-C_SIZE = 18
+C_FIRST_STEPS = 18  # steps of a block that have the time of its first one
+C_SIZE = 19
 
 RELEASE, BUGFIX, PRUSA = 0, 1, 2
 

@@ -211,7 +211,7 @@ def assign_rates(
     blocks: Blocks,
     foreign_s: Array,
     correction_s: Array,
-    instant: bool,
+    first_steps: float,
     timer_hz: float,
     least_hz: float,
     start_s: float,
@@ -221,8 +221,8 @@ def assign_rates(
     """Compute feedrates (mm/min, as printed) that reach every end on time.
 
     The firmware rounds the step rate up and the time of a step down to ticks; with junction
-    deviation a block that starts at the slower speed of the one before loses part of a step. Gains
-    and losses are carried over to the next segment.
+    deviation a block that starts at the slower speed of the one before loses part of a step (2.1)
+    or of two (2.0). Gains and losses are carried over to the next segment.
 
     Parameters
     ----------
@@ -230,8 +230,9 @@ def assign_rates(
         How long moves that are not ours take.
     correction_s : ndarray, shape (n,)
         Extra time of a block over this formula.
-    instant : bool
-        Every block starts at its own speed (classic jerk).
+    first_steps : float
+        Steps that have the time of a block's first one, at the speed of the block before; 0: every
+        block starts at its own speed (classic jerk).
     timer_hz : float
         Of the step timer.
     least_hz : float
@@ -270,11 +271,12 @@ def assign_rates(
         # The next one may begin at this one's slower speed: the share of a step that this takes is
         # time that the rest of this block does not have.
         slow_steps, slow_s = 0.0, 0.0
-        if not instant and i + 1 < len(steps) and ours[i + 1] and steps[i + 1] > 0.0:
+        if first_steps > 0.0 and i + 1 < len(steps) and ours[i + 1] and steps[i + 1] > 0.0:
             v_next = path_mm[i + 1] / planned_s[i + 1]
             next_per_mm = steps[i + 1] / path_mm[i + 1]
             if v_next * available > path:
-                slow_steps, slow_s = per_mm / next_per_mm, 1.0 / (v_next * next_per_mm)
+                slow_steps = first_steps * per_mm / next_per_mm
+                slow_s = first_steps / (v_next * next_per_mm)
         rate = n / available
         ticks = 0.0
         lost = 0.0
@@ -289,8 +291,9 @@ def assign_rates(
             rate = min(max(np.ceil(n / free), lowest), highest)
             lost = 0.0
             entry = min(before, rate / per_mm)
-            if not instant and entry > 0.0 and entry * per_mm < rate - 1.0:
-                lost = np.floor(timer_hz / np.ceil(entry * per_mm)) / timer_hz - ticks / timer_hz
+            if first_steps > 0.0 and entry > 0.0 and entry * per_mm < rate - 1.0:
+                slower = np.floor(timer_hz / np.ceil(entry * per_mm)) - ticks
+                lost = min(first_steps, n) * slower / timer_hz
         # Half a step per second below: the firmware rounds up.
         feedrate[i] = printed_feedrate(60.0 * max(rate - 0.5, 0.5 * rate) / per_mm)
         rate = np.ceil(feedrate[i] / 60.0 * per_mm - 1e-6)

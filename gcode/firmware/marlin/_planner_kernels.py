@@ -23,6 +23,7 @@ import numpy as np
 from stillpath.gcode.firmware.marlin._block_kernels import (
     BUGFIX,
     C_FAMILY,
+    C_FIRST_STEPS,
     C_MIN_RATE,
     C_QUEUE,
     C_S_CURVE,
@@ -213,6 +214,7 @@ def _steps(row: Any, entry: float, leave: float, facts: Any, shape: Any) -> None
             accel,
             rising,
             steps - falling,
+            facts[C_FIRST_STEPS] == 1.0,
             facts[C_TIMER_HZ],
             facts[C_SMOOTHING_HZ],
         )
@@ -233,6 +235,7 @@ def _steps(row: Any, entry: float, leave: float, facts: Any, shape: Any) -> None
             rising,
             steps - falling,
             bugfix,
+            facts[C_FIRST_STEPS] == 1.0,
             facts[C_TIMER_HZ],
             facts[C_SMOOTHING_HZ],
         )
@@ -260,17 +263,22 @@ def _step_time(
     rising: float,
     falls_from: float,
     bugfix: bool,
+    counts_first: bool,
     timer_hz: float,
     smoothing_hz: float,
 ) -> float:
-    """Time from the start of a block to its last step."""
+    """Time from the start of a block to its last step.
+
+    `counts_first`: the first step's time counts as time on the ramp (2.1); in 2.0 it does not, so
+    that the second step takes as long.
+    """
     fine = _parts_of_a_step(nominal, smoothing_hz)
     steps *= fine
     rising *= fine
     falls_from *= fine
     before = _interval(first, fine, timer_hz)
     total = before
-    t_up = 0.5 * before if bugfix else before
+    t_up = 0.5 * before if bugfix else before if counts_first else 0.0
     t_down = 0.5 * before if bugfix else 0.0
     rate = first
     # The releases look at the step just done, bugfix at the one to come.
@@ -306,19 +314,20 @@ def _curved_time(
     accel: float,
     rising: float,
     falls_from: float,
+    counts_first: bool,
     timer_hz: float,
     smoothing_hz: float,
 ) -> float:
     """Time of a block of the releases with short ramps along Bezier curves, step by step.
 
     The curve is entered where the first step, at the entry's speed, has come to: a ramp that is
-    shorter than that is not seen, as without S-curve.
+    shorter than that is not seen, as without S-curve. `counts_first` as for `_step_time`.
     """
     fine = _parts_of_a_step(nominal, smoothing_hz)
     steps, rising, falls_from = fine * steps, fine * rising, fine * falls_from
     total = _interval(first, fine, timer_hz)
     up_s, down_s = (peak - first) / accel, (peak - final) / accel
-    t = total
+    t = total if counts_first else 0.0
     accelerated = max(min(rising, steps - 1.0), 0.0)
     for _ in range(int(accelerated)):
         wait = _interval(_on_curve(first, peak, t, up_s), fine, timer_hz)

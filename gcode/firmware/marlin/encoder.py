@@ -31,7 +31,7 @@ from stillpath.gcode.firmware.encoding import (
     limits_in_force,
     to_units,
 )
-from stillpath.gcode.firmware.marlin._block_kernels import C_MIN_RATE
+from stillpath.gcode.firmware.marlin._block_kernels import C_FIRST_STEPS, C_MIN_RATE
 from stillpath.gcode.firmware.marlin._encoder_kernels import (
     Blocks,
     assign_rates,
@@ -155,9 +155,12 @@ class MarlinEncoder:
         if firmware.link == "serial":
             rate = min(rate, firmware.baud_rate / 10.0 / _BYTES_PER_LINE)
         self._rate = rate
-        self._least_hz = float(planner_facts(firmware, corexy=corexy)[C_MIN_RATE])
+        facts = planner_facts(firmware, corexy=corexy)
+        self._least_hz = float(facts[C_MIN_RATE])
         # With classic jerk a move starts at the jerk's speed, without a slow first step.
-        self._start_hz = self._least_hz if firmware.junction == "deviation" else np.inf
+        slow = firmware.junction == "deviation"
+        self._start_hz = self._least_hz if slow else np.inf
+        self._first_steps = float(facts[C_FIRST_STEPS]) if slow else 0.0
         self._burst = 0.5 * firmware.block_buffer_size
         low, high = steps_within(travel_mm, self._scale)
         self._lattice = Lattice(
@@ -255,7 +258,7 @@ class MarlinEncoder:
                 blocks,
                 actual,
                 correction,
-                self._firmware.junction == "classic_jerk",
+                self._first_steps,
                 self._firmware.step_timer_hz,
                 self._least_hz,
                 begin_s,
