@@ -37,6 +37,7 @@ ASSUMED = {
     "min_steps_per_segment": 6,
     "block_buffer_size": 16,
     "s_curve": False,
+    "step_smoothing_hz": 0,
 }
 """Settings that a stream depends on but M503 does not report, as in most builds."""
 

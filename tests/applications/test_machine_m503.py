@@ -106,7 +106,7 @@ def test_what_m503_says_is_in_the_machine(make, capsys) -> None:
     assert (code, err) == (0, "")
     assert "mine: revision 1" in out
     assumed = next(line for line in out.splitlines() if "assumed" in line)
-    assert "block_buffer_size=16, s_curve=false" in assumed
+    assert "block_buffer_size=16, s_curve=false, step_smoothing_hz=0;" in assumed
     assert "min_steps_per_segment" not in assumed
 
     machine = stored(capsys)

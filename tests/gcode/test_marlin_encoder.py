@@ -102,7 +102,7 @@ def test_rates_reach_the_ends_in_time(seed: int, per_mm: float, first_steps: flo
     feedrate, predicted = np.zeros(n), np.zeros(n)
     ours, fastest, none = np.ones(n, np.bool_), np.full(n, 500.0), np.zeros(n)
     blocks = Blocks(ours, steps, steps / per_mm, np.cumsum(planned_s), planned_s, fastest)
-    assign_rates(blocks, none, none, first_steps, 2e6, 120.0, 0.0, feedrate, predicted)
+    assign_rates(blocks, none, none, first_steps, 2e6, 0.0, 120.0, 0.0, feedrate, predicted)
     late_s = np.cumsum(predicted)[5:] - np.cumsum(planned_s)[5:]
     # A block may end early by the share of a step, or of two, that the next one loses.
     assert np.all(late_s < 1.5e-4)
@@ -120,7 +120,7 @@ def test_what_a_stand_is_too_short_is_made_up_for() -> None:
     ends_s = np.cumsum(planned_s)
     per_mm, fastest = 80.0, np.full(4, 500.0)
     blocks = Blocks(ours, steps, steps / per_mm, ends_s, planned_s, fastest)
-    assign_rates(blocks, free, free, 0.0, 2e6, 120.0, 0.0, feedrate, predicted)
+    assign_rates(blocks, free, free, 0.0, 2e6, 0.0, 120.0, 0.0, feedrate, predicted)
     assert predicted[1] == pytest.approx(1 / 120.0, rel=1e-3)
     assert np.sum(predicted) == pytest.approx(ends_s[-1], abs=1e-4)
 
@@ -230,6 +230,16 @@ def test_a_print_is_compensated_and_its_limits_come_back(tmp_path: Path, cache: 
     assert last[8:11] == (1500.0, 500.0, 1800.0)
     assert last[:8] == initial_limits(firmware).as_row()[:8]
     assert last[15:17] == (0.02, 20_000.0)
+
+
+def test_a_machine_that_times_parts_of_steps_is_compensated(tmp_path: Path, cache: Path) -> None:
+    """ADAPTIVE_STEP_SMOOTHING: rates are coarser by it, which had half the file reverted."""
+    facts = {"home_mm": (0.0, 0.0, 0.0), "step_smoothing_hz": 120_000.0}
+    machine = with_firmware(FIRMWARE.model_copy(update=facts))
+    result, _ = compensated(PRINT, tmp_path, cache, machine)
+    assert result.pieces > 0
+    assert result.put_back == []
+    assert result.emission_max_um < 20.0
 
 
 @pytest.mark.slow

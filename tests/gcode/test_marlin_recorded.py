@@ -81,3 +81,15 @@ def test_moves_that_speed_up_and_slow_down(variant: Any, s_curve: bool) -> None:
     firmware = FIRMWARE.model_copy(update={"variant": variant, "s_curve": s_curve})
     found = lasts_ms(np.column_stack([steps, 0 * steps, 0 * steps]), speed, firmware, **limits)
     assert found == pytest.approx(RAMPS[variant, s_curve], abs=0.01)
+
+
+def test_parts_of_steps() -> None:
+    """With ADAPTIVE_STEP_SMOOTHING at 72 MHz; parts of no step end the last move, left out here."""
+    steps = np.cumsum([0, 40, 6, 12, 8, 30, 6, 80, 20, 10, 100])
+    speed = np.array([10.0, 40.0, 15.0, 60.0, 20.0, 80.0, 100.0, 5.0, 50.0, 30.0])
+    limits = {f"{kind}_accel_mm_s2": 5000.0 for kind in ("print", "travel")}
+    limits |= {"accel_x_mm_s2": 5000.0, "junction_deviation_mm": 0.05}
+    firmware = FIRMWARE.model_copy(update={"step_smoothing_hz": 30_769.0})
+    found = lasts_ms(np.column_stack([steps, 0 * steps, 0 * steps]), speed, firmware, **limits)
+    recorded = [50.683, 4.0405, 9.984, 4.2715, 18.72, 2.8015, 20.0295, 49.92, 6.2395]
+    assert found[:-1] == pytest.approx(recorded, abs=0.01)

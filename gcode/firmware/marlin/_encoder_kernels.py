@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from stillpath.gcode.firmware._vertex_kernels import hop
 from stillpath.gcode.firmware._writing_kernels import printed_feedrate
+from stillpath.gcode.firmware.marlin._planner_kernels import parts_of_a_step
 from stillpath.models.arrays import Array
 from stillpath.models.jit import kernel
 
@@ -213,6 +214,7 @@ def assign_rates(
     correction_s: Array,
     first_steps: float,
     timer_hz: float,
+    smoothing_hz: float,
     least_hz: float,
     start_s: float,
     feedrate: Array,
@@ -233,8 +235,8 @@ def assign_rates(
     first_steps : float
         Steps that have the time of a block's first one, at the speed of the block before; 0: every
         block starts at its own speed (classic jerk).
-    timer_hz : float
-        Of the step timer.
+    timer_hz, smoothing_hz : float
+        Of the step timer; rate up to which parts of a step are timed, each in whole ticks.
     least_hz : float
         Lowest step rate; the difference to slower motion or standstill is carried over too.
     feedrate, predicted_s : ndarray, shape (n,)
@@ -280,25 +282,28 @@ def assign_rates(
         rate = n / available
         ticks = 0.0
         lost = 0.0
+        timer = timer_hz
         for _ in range(3):
+            fine = parts_of_a_step(rate, smoothing_hz)
+            timer = timer_hz / fine
             free = max(available - lost, least)
             if slow_s != 0.0:
-                free = max((free + slow_s) / (1.0 + slow_steps / n), 0.5 * free)
-            ticks = max(np.round(timer_hz * free / n), 1.0)
-            ticks = min(ticks, np.floor(timer_hz / least_hz))
+                free = max((free + slow_s / fine) / (1.0 + slow_steps / (n * fine)), 0.5 * free)
+            ticks = max(np.round(timer * free / n), 1.0)
+            ticks = min(ticks, np.floor(timer / least_hz))
             # Of the rates that give these ticks, the one nearest to the intended rate.
-            lowest, highest = np.floor(timer_hz / (ticks + 1.0)) + 1.0, np.floor(timer_hz / ticks)
+            lowest, highest = np.floor(timer / (ticks + 1.0)) + 1.0, np.floor(timer / ticks)
             rate = min(max(np.ceil(n / free), lowest), highest)
             lost = 0.0
             entry = min(before, rate / per_mm)
             if first_steps > 0.0 and entry > 0.0 and entry * per_mm < rate - 1.0:
-                slower = np.floor(timer_hz / np.ceil(entry * per_mm)) - ticks
-                lost = min(first_steps, n) * slower / timer_hz
+                slower = np.floor(timer / np.ceil(entry * per_mm)) - ticks
+                lost = min(first_steps / fine, n) * slower / timer
         # Half a step per second below: the firmware rounds up.
         feedrate[i] = printed_feedrate(60.0 * max(rate - 0.5, 0.5 * rate) / per_mm)
         rate = np.ceil(feedrate[i] / 60.0 * per_mm - 1e-6)
-        ticks = np.floor(timer_hz / rate)
-        predicted_s[i] = n * ticks / timer_hz + lost + correction_s[i]
+        ticks = np.floor(timer / rate)
+        predicted_s[i] = n * ticks / timer + lost + correction_s[i]
         now += predicted_s[i]
         if first:
             late += predicted_s[i] - planned_s[i]

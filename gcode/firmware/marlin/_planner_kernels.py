@@ -47,7 +47,7 @@ from stillpath.gcode.firmware.marlin._block_kernels import (
 )
 from stillpath.models.jit import kernel
 
-__all__ = ["emit", "settle"]
+__all__ = ["emit", "parts_of_a_step", "settle"]
 
 _FEW = 12  # steps that are always counted one by one
 _FEW_CURVED = 100.0  # the same of ramps along curves; longer ones take the time of straight ones
@@ -241,7 +241,8 @@ def _steps(row: Any, entry: float, leave: float, facts: Any, shape: Any) -> None
         )
         # Without a step on the ramp the speed jumps to that of the next block.
         flat = falling <= (0.0 if bugfix else 1.0)
-    cruise = 1.0 / _interval(nominal, 1.0, facts[C_TIMER_HZ])
+    fine = parts_of_a_step(nominal, facts[C_SMOOTHING_HZ])
+    cruise = 1.0 / (fine * _interval(nominal, fine, facts[C_TIMER_HZ]))
     _fit(steps, min(first, cruise), cruise, cruise if flat else min(final, cruise), duration, shape)
     for k in range(4):
         shape[k] /= per_mm
@@ -272,7 +273,7 @@ def _step_time(
     `counts_first`: the first step's time counts as time on the ramp (2.1); in 2.0 it does not, so
     that the second step takes as long.
     """
-    fine = _parts_of_a_step(nominal, smoothing_hz)
+    fine = parts_of_a_step(nominal, smoothing_hz)
     steps *= fine
     rising *= fine
     falls_from *= fine
@@ -323,7 +324,7 @@ def _curved_time(
     The curve is entered where the first step, at the entry's speed, has come to: a ramp that is
     shorter than that is not seen, as without S-curve. `counts_first` as for `_step_time`.
     """
-    fine = _parts_of_a_step(nominal, smoothing_hz)
+    fine = parts_of_a_step(nominal, smoothing_hz)
     steps, rising, falls_from = fine * steps, fine * rising, fine * falls_from
     total = _interval(first, fine, timer_hz)
     up_s, down_s = (peak - first) / accel, (peak - final) / accel
@@ -345,7 +346,7 @@ def _curved_time(
 
 
 @kernel(inline=True)
-def _parts_of_a_step(nominal: float, smoothing_hz: float) -> float:
+def parts_of_a_step(nominal: float, smoothing_hz: float) -> float:
     """Find how many parts of a step ADAPTIVE_STEP_SMOOTHING times for each step."""
     fine = 1.0
     rate = nominal

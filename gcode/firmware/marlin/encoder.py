@@ -260,6 +260,7 @@ class MarlinEncoder:
                 correction,
                 self._first_steps,
                 self._firmware.step_timer_hz,
+                self._firmware.step_smoothing_hz,
                 self._least_hz,
                 begin_s,
                 feedrate,
