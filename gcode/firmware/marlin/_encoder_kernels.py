@@ -197,6 +197,8 @@ class Blocks(NamedTuple):
     end_s, planned_s : ndarray
         When a segment is to end, and how long it is to last.
     fastest_mm_s : ndarray
+    at_once_mm_s : ndarray
+        Speed that a segment may begin with whatever came before it (classic jerk), or 0.
     """
 
     ours: NDArray[np.bool_]
@@ -205,6 +207,7 @@ class Blocks(NamedTuple):
     end_s: Array
     planned_s: Array
     fastest_mm_s: Array
+    at_once_mm_s: Array
 
 
 @kernel
@@ -222,9 +225,9 @@ def assign_rates(
 ) -> None:
     """Compute feedrates (mm/min, as printed) that reach every end on time.
 
-    The firmware rounds the step rate up and the time of a step down to ticks; with junction
-    deviation a block that starts at the slower speed of the one before loses part of a step (2.1)
-    or of two (2.0). Gains and losses are carried over to the next segment.
+    The firmware rounds the step rate up and the time of a step down to ticks; a block that starts
+    at the slower speed of the one before loses part of a step (2.1) or of two (2.0). Gains and
+    losses are carried over to the next segment.
 
     Parameters
     ----------
@@ -233,8 +236,7 @@ def assign_rates(
     correction_s : ndarray, shape (n,)
         Extra time of a block over this formula.
     first_steps : float
-        Steps that have the time of a block's first one, at the speed of the block before; 0: every
-        block starts at its own speed (classic jerk).
+        Steps that have the time of a block's first one, at the speed of the block before.
     timer_hz, smoothing_hz : float
         Of the step timer; rate up to which parts of a step are timed, each in whole ticks.
     least_hz : float
@@ -242,7 +244,7 @@ def assign_rates(
     feedrate, predicted_s : ndarray, shape (n,)
         Filled.
     """
-    ours, steps, path_mm, end_s, planned_s, fastest_mm_s = blocks
+    ours, steps, path_mm, end_s, planned_s, fastest_mm_s, at_once_mm_s = blocks
     now = start_s
     before = 0.0
     late = 0.0
@@ -273,12 +275,16 @@ def assign_rates(
         # The next one may begin at this one's slower speed: the share of a step that this takes is
         # time that the rest of this block does not have.
         slow_steps, slow_s = 0.0, 0.0
-        if first_steps > 0.0 and i + 1 < len(steps) and ours[i + 1] and steps[i + 1] > 0.0:
+        if i + 1 < len(steps) and ours[i + 1] and steps[i + 1] > 0.0:
             v_next = path_mm[i + 1] / planned_s[i + 1]
             next_per_mm = steps[i + 1] / path_mm[i + 1]
+            at_once = min(at_once_mm_s[i + 1], v_next)
             if v_next * available > path:
-                slow_steps = first_steps * per_mm / next_per_mm
                 slow_s = first_steps / (v_next * next_per_mm)
+                if at_once * available > path:
+                    slow_s -= first_steps / (at_once * next_per_mm)
+                else:
+                    slow_steps = first_steps * per_mm / next_per_mm
         rate = n / available
         ticks = 0.0
         lost = 0.0
@@ -295,8 +301,8 @@ def assign_rates(
             lowest, highest = np.floor(timer / (ticks + 1.0)) + 1.0, np.floor(timer / ticks)
             rate = min(max(np.ceil(n / free), lowest), highest)
             lost = 0.0
-            entry = min(before, rate / per_mm)
-            if first_steps > 0.0 and entry > 0.0 and entry * per_mm < rate - 1.0:
+            entry = min(max(before, at_once_mm_s[i]), rate / per_mm)
+            if before > 0.0 and entry * per_mm < rate - 1.0:
                 slower = np.floor(timer / np.ceil(entry * per_mm)) - ticks
                 lost = min(first_steps / fine, n) * slower / timer
         # Half a step per second below: the firmware rounds up.
