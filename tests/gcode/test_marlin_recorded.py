@@ -93,3 +93,18 @@ def test_parts_of_steps() -> None:
     found = lasts_ms(np.column_stack([steps, 0 * steps, 0 * steps]), speed, firmware, **limits)
     recorded = [50.683, 4.0405, 9.984, 4.2715, 18.72, 2.8015, 20.0295, 49.92, 6.2395]
     assert found[:-1] == pytest.approx(recorded, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("variant", "recorded"),
+    [("2.0", [340.1235, 363.8415, 361.35, 506.888]), ("2.1", [331.951, 363.8145, 361.35, 506.62])],
+)
+def test_long_ramps_along_s_curves(variant: Any, recorded: list[float]) -> None:
+    """As slicers write them; until 2026-11 they had the time of straight ramps, 27 ms too much."""
+    steps = np.cumsum([0, 1600, 2400, 900, 3000])
+    speed = np.array([77.77, 93.33, 31.11, 93.33])
+    limits = {f"{kind}_accel_mm_s2": 500.0 for kind in ("print", "travel")}
+    limits |= {"accel_x_mm_s2": 500.0, "junction_deviation_mm": 0.05}
+    firmware = FIRMWARE.model_copy(update={"variant": variant, "s_curve": True})
+    found = lasts_ms(np.column_stack([steps, 0 * steps, 0 * steps]), speed, firmware, **limits)
+    assert found == pytest.approx(recorded, abs=0.2)

@@ -50,7 +50,6 @@ from stillpath.models.jit import kernel
 __all__ = ["emit", "parts_of_a_step", "settle"]
 
 _FEW = 12  # steps that are always counted one by one
-_FEW_CURVED = 100.0  # the same of ramps along curves; longer ones take the time of straight ones
 _SMALL = 0.01  # relative change of the rate in a step, below which a ramp is summed in closed form
 _TINY_S = 1e-12
 
@@ -204,7 +203,7 @@ def _steps(row: Any, entry: float, leave: float, facts: Any, shape: Any) -> None
         rising = min(max(floor(half + 0.5) if bugfix else ceil(half), 0.0), steps)
         falling = steps - rising
         peak = min(sqrt(first * first + 2.0 * accel * rising), nominal)
-    if facts[C_S_CURVE] != 0.0 and not bugfix and rising + falling <= _FEW_CURVED:
+    if facts[C_S_CURVE] != 0.0 and not bugfix:
         duration = _curved_time(
             steps,
             first,
@@ -220,7 +219,7 @@ def _steps(row: Any, entry: float, leave: float, facts: Any, shape: Any) -> None
         )
         flat = falling <= 1.0
     elif facts[C_S_CURVE] != 0.0:
-        # Along the Bezier curve as along the line: the same time and the same way.
+        # bugfix: along the Bezier curve as along the line, the same time and the same way.
         level = max(steps - rising - falling, 0.0)
         first, final = min(first, peak), min(final, peak)
         duration = max((2.0 * peak - first - final) / accel + level / peak, steps / peak)
@@ -319,7 +318,7 @@ def _curved_time(
     timer_hz: float,
     smoothing_hz: float,
 ) -> float:
-    """Time of a block of the releases with short ramps along Bezier curves, step by step.
+    """Time of a block of the releases with ramps along Bezier curves, step by step.
 
     The curve is entered where the first step, at the entry's speed, has come to: a ramp that is
     shorter than that is not seen, as without S-curve. `counts_first` as for `_step_time`.
