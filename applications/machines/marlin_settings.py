@@ -43,6 +43,9 @@ ASSUMED = {
 
 _COMMAND = re.compile(r"(M\d{2,3})((?:\s+[A-Z](?:-?\d+(?:\.\d*)?)?)+)\s*(?:;.*)?$")
 _WORD = re.compile(r"([A-Z])(-?\d+(?:\.\d*)?)?")
+_MARLIN_2_0 = re.compile(r"Advanced: B<|FIRMWARE_NAME:Marlin 2\.0\b")
+"""Heading of M205 in 2.0.5 to 2.0.9.1 and forks of them (settings.cpp; since 2.0.9.2 `Advanced
+(B<`), or what M115 says."""
 _ROUNDED = (
     "planner.junction_deviation_mm",
     "linear_advance_k_s",
@@ -152,6 +155,8 @@ def _versions(found: dict[str, _Words], text: str) -> dict[str, Any]:
     if "M970" in found or "Prusa-Firmware-Buddy" in text:
         # Phase stepping, which only that firmware has (configuration_store.cpp, 2025-04), or M115.
         section["variant"] = "prusa"
+    elif _MARLIN_2_0.search(text):
+        section["variant"] = "2.0"
     if "M493" in found:
         # Version 1 reports Y's frequency as B, version 2 one line for each axis.
         section["ft_motion_version"] = 1 if "B" in found["M493"] else 2
