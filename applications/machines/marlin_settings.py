@@ -37,6 +37,7 @@ ASSUMED = {
     "min_steps_per_segment": 6,
     "block_buffer_size": 16,
     "s_curve": False,
+    "step_smoothing_hz": 0,
 }
 """Settings that a stream depends on but M503 does not report, as in most builds."""
 
@@ -44,6 +45,9 @@ _COMMAND = re.compile(r"(M\d{2,3})((?:\s+[A-Z](?:-?\d+(?:\.\d*)?)?)+)\s*(?:;.*)?
 _REPRAP = re.compile(r"(?m)^[^;\n]*\b(M566|M584)\b")
 """Jerk and drivers, which each config.g sets and no Marlin prints."""
 _WORD = re.compile(r"([A-Z])(-?\d+(?:\.\d*)?)?")
+_MARLIN_2_0 = re.compile(r"Advanced: B<|FIRMWARE_NAME:Marlin 2\.0\b")
+"""Heading of M205 in 2.0.5 to 2.0.9.1 and forks of them (settings.cpp; since 2.0.9.2 `Advanced
+(B<`), or what M115 says."""
 _ROUNDED = (
     "planner.junction_deviation_mm",
     "linear_advance_k_s",
@@ -165,6 +169,8 @@ def _versions(found: dict[str, _Words], text: str) -> dict[str, Any]:
     if "M970" in found or "Prusa-Firmware-Buddy" in text:
         # Phase stepping, which only that firmware has (configuration_store.cpp, 2025-04), or M115.
         section["variant"] = "prusa"
+    elif _MARLIN_2_0.search(text):
+        section["variant"] = "2.0"
     if "M493" in found:
         # Version 1 reports Y's frequency as B, version 2 one line for each axis.
         section["ft_motion_version"] = 1 if "B" in found["M493"] else 2

@@ -88,7 +88,7 @@ class Marlin(FirmwareFacts):
 
     kind: Literal["marlin"] = "marlin"
     variant: Literal["2.0", "2.1", "bugfix", "prusa", "bambu"] = "2.1"
-    """Which rules the planner follows: releases 2.0.x and 2.1.x up to 2.1.2, the planner of
+    """Which rules the planner follows: releases 2.0.x, releases 2.1.x up to 2.1.2, the planner of
     bugfix-2.1.x since 2024, Prusa-Firmware-Buddy, or Bambu's closed firmware (an estimate)."""
     extruder: Hotend = Hotend()
     planner: MarlinPlanner = MarlinPlanner()

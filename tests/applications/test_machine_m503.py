@@ -99,6 +99,25 @@ def test_what_other_tools_have_is_told(make) -> None:
     assert "other tools differ: M203 T1 E45; " in out
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        M503.replace("Advanced (B", "Advanced: B").replace("J<junc_dev>):", "J<junc_dev>"),
+        "Recv: FIRMWARE_NAME:Marlin 2.0.9.3 (Jan 27 2022 12:07:46) SOURCE_CODE_URL:..\n" + M503,
+    ],
+)
+def test_marlin_2_0_is_noticed(make, capsys, text: str) -> None:
+    """Its first steps are slower than 2.1's: a file for the wrong one is executed late."""
+    code, out, _ = make(text)
+    assert (code, stored(capsys).firmware.variant) == (0, "2.0")
+    assert "variant=2.1" not in out
+    _, out, _ = make(text, "--name", "other", "--set", "variant=2.1")
+    assert "variant" not in out
+    newer = "FIRMWARE_NAME:Marlin 2.1.2.5 (Nov 18 2024)\n" + M503
+    _, out, _ = make(newer, "--name", "newer")
+    assert "variant=2.1" in out
+
+
 def test_what_m503_says_is_in_the_machine(make, capsys) -> None:
     code, out, err = make(
         M503, "--set", "min_steps_per_segment=1", "--set", "variant=2.0", "--fy", "29"
@@ -106,7 +125,7 @@ def test_what_m503_says_is_in_the_machine(make, capsys) -> None:
     assert (code, err) == (0, "")
     assert "mine: revision 1" in out
     assumed = next(line for line in out.splitlines() if "assumed" in line)
-    assert "block_buffer_size=16, s_curve=false" in assumed
+    assert "block_buffer_size=16, s_curve=false, step_smoothing_hz=0;" in assumed
     assert "min_steps_per_segment" not in assumed
 
     machine = stored(capsys)

@@ -199,14 +199,14 @@ def arc(turn_rad: float, side_mm: float, count: int) -> Any:
 
 
 def test_short_segments_are_part_of_an_arc() -> None:
-    # .5 mm, 30 degrees: arc of v2 = .5 * 5000 / acos(.866); Marlin's polynomial gives
-    # pi/2 - 1.0259 = .5449 rad: 4588, 67.73 mm/s. By the angle alone it were
-    # 5000 * .08 * .9659 / .0341 = 11 340.
+    # .5 mm, 30 degrees: arc of v2 = .5 * 5000 / acos(.866); Marlin's broken line from
+    # 1.0075 acos(.75) = .7282 to 1.0075 acos(.875) = .5092 gives .5249 rad: 4763, 69.01 mm/s.
+    # By the angle alone it were 5000 * .08 * .9659 / .0341 = 11 340.
     wide = {"accel_x_mm_s2": 5000.0, "accel_y_mm_s2": 5000.0, "travel_accel_mm_s2": 5000.0}
     points = arc(math.radians(30), 0.5, 40)
     fine = PerAxis(x=4000.0, y=4000.0, z=400.0, e=100.0)  # so that rounding bends nothing
     phases = plan(machine(steps_per_mm=fine), points, 150.0, **wide)
-    assert phases.start_mm_s[20] == pytest.approx(67.73, rel=2e-3)
+    assert phases.start_mm_s[20] == pytest.approx(69.01, rel=2e-3)
     phases = plan(machine(steps_per_mm=fine, small_segment_junctions=False), points, 150.0, **wide)
     assert phases.start_mm_s[12] > 75.0
 

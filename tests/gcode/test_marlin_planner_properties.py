@@ -180,6 +180,7 @@ def interrupts(
     rising: int,
     falls_from: int,
     bugfix: bool,
+    counts_first: bool,
     fine: int,
 ) -> float:
     """Time of a block, interrupt by interrupt (stepper.cpp, `block_phase_isr`), 2 MHz."""
@@ -190,7 +191,7 @@ def interrupts(
     steps, rising, falls_from = steps * fine, rising * fine, falls_from * fine
     wait = ticks(first)
     total, done, accelerated, cruised = wait, 1, first, False
-    t_up = 0.5 * wait if bugfix else wait
+    t_up = 0.5 * wait if bugfix else wait * counts_first
     t_down = 0.5 * wait if bugfix else 0.0
     while done < steps:
         if done < rising if bugfix else done <= rising:
@@ -218,6 +219,7 @@ def interrupts(
     st.floats(0.0, 1.0),
     st.floats(0.0, 1.0),
     st.booleans(),
+    st.booleans(),
     st.sampled_from([0.0, 30_000.0]),
 )
 @settings(max_examples=60)
@@ -228,6 +230,7 @@ def test_step_times_are_those_of_the_interrupts(
     low: float,
     high: float,
     bugfix: bool,
+    counts_first: bool,
     smoothing_hz: float,
 ) -> None:
     accel = 10.0**decades
@@ -243,8 +246,9 @@ def test_step_times_are_those_of_the_interrupts(
     fine = 1
     while nominal * fine * 2 < smoothing_hz:
         fine *= 2
+    falls_from = steps - falling
     expected = interrupts(
-        steps, first, nominal, final, accel, rising, steps - falling, bugfix, fine
+        steps, first, nominal, final, accel, rising, falls_from, bugfix, counts_first, fine
     )
     found = _step_time(
         float(steps),
@@ -253,8 +257,9 @@ def test_step_times_are_those_of_the_interrupts(
         final,
         accel,
         float(rising),
-        float(steps - falling),
+        float(falls_from),
         bugfix,
+        counts_first,
         2e6,
         smoothing_hz,
     )

@@ -14,6 +14,8 @@ from __future__ import annotations
 from math import ceil, floor, sqrt
 from typing import Any
 
+import numpy as np
+
 from stillpath.models.jit import kernel
 
 __all__ = ["append"]
@@ -58,7 +60,8 @@ C_FAMILY, C_CORE, C_CLASSIC_JERK, C_SMALL_SEGMENTS = 4, 5, 6, 7
 C_MIN_STEPS, C_QUEUE, C_SLOWDOWN, C_MIN_SPEED, C_ADVANCE = 8, 9, 10, 11, 12
 C_TIMER_HZ, C_SMOOTHING_HZ, C_MIN_RATE, C_S_CURVE = 13, 14, 15, 16
 C_RESTS_APART = 17  # short moves are not joined with moves of Z or the extruder alone
-C_SIZE = 18
+C_FIRST_STEPS = 18  # steps of a block that have the time of its first one
+C_SIZE = 19
 
 RELEASE, BUGFIX, PRUSA = 0, 1, 2
 
@@ -68,6 +71,13 @@ _STILL = 1e-6
 _STRAIGHT = 0.999999
 _SAME_MM = 1e-7  # positions closer than this are one
 _NOISE = 1e-9
+
+_TURN_CORNERS = 17
+_TURN_COSINE = 1.0 - 0.5 ** np.arange(_TURN_CORNERS)
+_TURN_COSINE[-1] = _STRAIGHT
+_TURN_ANGLE = np.arccos(_TURN_COSINE)
+_TURN_ANGLE[1:-1] *= 1.00751495
+"""Corners of the broken line by which the firmware finds the angle of a slight turn, rad."""
 
 
 @kernel(inline=True)
@@ -379,15 +389,13 @@ def _turn(cosine: float, prusa: bool) -> float:
         return 3.141592654 - theta if theta > 2.35619449 else 0.0
     if cosine >= -0.7071067812:
         return 0.0
-    t = -cosine
-    arcsine = 84.31466202
-    arcsine = arcsine * t - 242.7199627
-    arcsine = arcsine * t + 262.8130562
-    arcsine = arcsine * t - 131.1123477
-    arcsine = arcsine * t + 29.66153956
-    arcsine = arcsine * t - 1.451838349
-    arcsine = arcsine * t + 0.032843707
-    return 1.570796327 - arcsine
+    # JD_USE_LOOKUP_TABLE, which planner.h defines since 2020-05 (#17817): straight lines between
+    # the points 1 - 2^-k of the arc cosine, with a factor that centres the error.
+    k = 0
+    while k < _TURN_CORNERS - 2 and -cosine >= _TURN_COSINE[k + 1]:
+        k += 1
+    slope = (_TURN_ANGLE[k + 1] - _TURN_ANGLE[k]) / (_TURN_COSINE[k + 1] - _TURN_COSINE[k])
+    return float(_TURN_ANGLE[k] + slope * (-cosine - _TURN_COSINE[k]))
 
 
 @kernel

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from stillpath.gcode.firmware._vertex_kernels import hop
 from stillpath.gcode.firmware._writing_kernels import printed_feedrate
+from stillpath.gcode.firmware.marlin._planner_kernels import parts_of_a_step
 from stillpath.models.arrays import Array
 from stillpath.models.jit import kernel
 
@@ -196,6 +197,8 @@ class Blocks(NamedTuple):
     end_s, planned_s : ndarray
         When a segment is to end, and how long it is to last.
     fastest_mm_s : ndarray
+    at_once_mm_s : ndarray
+        Speed that a segment may begin with whatever came before it (classic jerk), or 0.
     """
 
     ours: NDArray[np.bool_]
@@ -204,6 +207,7 @@ class Blocks(NamedTuple):
     end_s: Array
     planned_s: Array
     fastest_mm_s: Array
+    at_once_mm_s: Array
 
 
 @kernel
@@ -211,8 +215,9 @@ def assign_rates(
     blocks: Blocks,
     foreign_s: Array,
     correction_s: Array,
-    instant: bool,
+    first_steps: float,
     timer_hz: float,
+    smoothing_hz: float,
     least_hz: float,
     start_s: float,
     feedrate: Array,
@@ -220,9 +225,9 @@ def assign_rates(
 ) -> None:
     """Compute feedrates (mm/min, as printed) that reach every end on time.
 
-    The firmware rounds the step rate up and the time of a step down to ticks; with junction
-    deviation a block that starts at the slower speed of the one before loses part of a step. Gains
-    and losses are carried over to the next segment.
+    The firmware rounds the step rate up and the time of a step down to ticks; a block that starts
+    at the slower speed of the one before loses part of a step (2.1) or of two (2.0). Gains and
+    losses are carried over to the next segment.
 
     Parameters
     ----------
@@ -230,16 +235,16 @@ def assign_rates(
         How long moves that are not ours take.
     correction_s : ndarray, shape (n,)
         Extra time of a block over this formula.
-    instant : bool
-        Every block starts at its own speed (classic jerk).
-    timer_hz : float
-        Of the step timer.
+    first_steps : float
+        Steps that have the time of a block's first one, at the speed of the block before.
+    timer_hz, smoothing_hz : float
+        Of the step timer; rate up to which parts of a step are timed, each in whole ticks.
     least_hz : float
         Lowest step rate; the difference to slower motion or standstill is carried over too.
     feedrate, predicted_s : ndarray, shape (n,)
         Filled.
     """
-    ours, steps, path_mm, end_s, planned_s, fastest_mm_s = blocks
+    ours, steps, path_mm, end_s, planned_s, fastest_mm_s, at_once_mm_s = blocks
     now = start_s
     before = 0.0
     late = 0.0
@@ -270,32 +275,41 @@ def assign_rates(
         # The next one may begin at this one's slower speed: the share of a step that this takes is
         # time that the rest of this block does not have.
         slow_steps, slow_s = 0.0, 0.0
-        if not instant and i + 1 < len(steps) and ours[i + 1] and steps[i + 1] > 0.0:
+        if i + 1 < len(steps) and ours[i + 1] and steps[i + 1] > 0.0:
             v_next = path_mm[i + 1] / planned_s[i + 1]
             next_per_mm = steps[i + 1] / path_mm[i + 1]
+            at_once = min(at_once_mm_s[i + 1], v_next)
             if v_next * available > path:
-                slow_steps, slow_s = per_mm / next_per_mm, 1.0 / (v_next * next_per_mm)
+                slow_s = first_steps / (v_next * next_per_mm)
+                if at_once * available > path:
+                    slow_s -= first_steps / (at_once * next_per_mm)
+                else:
+                    slow_steps = first_steps * per_mm / next_per_mm
         rate = n / available
         ticks = 0.0
         lost = 0.0
+        timer = timer_hz
         for _ in range(3):
+            fine = parts_of_a_step(rate, smoothing_hz)
+            timer = timer_hz / fine
             free = max(available - lost, least)
             if slow_s != 0.0:
-                free = max((free + slow_s) / (1.0 + slow_steps / n), 0.5 * free)
-            ticks = max(np.round(timer_hz * free / n), 1.0)
-            ticks = min(ticks, np.floor(timer_hz / least_hz))
+                free = max((free + slow_s / fine) / (1.0 + slow_steps / (n * fine)), 0.5 * free)
+            ticks = max(np.round(timer * free / n), 1.0)
+            ticks = min(ticks, np.floor(timer / least_hz))
             # Of the rates that give these ticks, the one nearest to the intended rate.
-            lowest, highest = np.floor(timer_hz / (ticks + 1.0)) + 1.0, np.floor(timer_hz / ticks)
+            lowest, highest = np.floor(timer / (ticks + 1.0)) + 1.0, np.floor(timer / ticks)
             rate = min(max(np.ceil(n / free), lowest), highest)
             lost = 0.0
-            entry = min(before, rate / per_mm)
-            if not instant and entry > 0.0 and entry * per_mm < rate - 1.0:
-                lost = np.floor(timer_hz / np.ceil(entry * per_mm)) / timer_hz - ticks / timer_hz
+            entry = min(max(before, at_once_mm_s[i]), rate / per_mm)
+            if before > 0.0 and entry * per_mm < rate - 1.0:
+                slower = np.floor(timer / np.ceil(entry * per_mm)) - ticks
+                lost = min(first_steps / fine, n) * slower / timer
         # Half a step per second below: the firmware rounds up.
         feedrate[i] = printed_feedrate(60.0 * max(rate - 0.5, 0.5 * rate) / per_mm)
         rate = np.ceil(feedrate[i] / 60.0 * per_mm - 1e-6)
-        ticks = np.floor(timer_hz / rate)
-        predicted_s[i] = n * ticks / timer_hz + lost + correction_s[i]
+        ticks = np.floor(timer / rate)
+        predicted_s[i] = n * ticks / timer + lost + correction_s[i]
         now += predicted_s[i]
         if first:
             late += predicted_s[i] - planned_s[i]

@@ -23,6 +23,7 @@ import numpy as np
 from stillpath.gcode.firmware.marlin._block_kernels import (
     BUGFIX,
     C_FAMILY,
+    C_FIRST_STEPS,
     C_MIN_RATE,
     C_QUEUE,
     C_S_CURVE,
@@ -46,10 +47,9 @@ from stillpath.gcode.firmware.marlin._block_kernels import (
 )
 from stillpath.models.jit import kernel
 
-__all__ = ["emit", "settle"]
+__all__ = ["emit", "parts_of_a_step", "settle"]
 
 _FEW = 12  # steps that are always counted one by one
-_FEW_CURVED = 100.0  # the same of ramps along curves; longer ones take the time of straight ones
 _SMALL = 0.01  # relative change of the rate in a step, below which a ramp is summed in closed form
 _TINY_S = 1e-12
 
@@ -203,7 +203,7 @@ def _steps(row: Any, entry: float, leave: float, facts: Any, shape: Any) -> None
         rising = min(max(floor(half + 0.5) if bugfix else ceil(half), 0.0), steps)
         falling = steps - rising
         peak = min(sqrt(first * first + 2.0 * accel * rising), nominal)
-    if facts[C_S_CURVE] != 0.0 and not bugfix and rising + falling <= _FEW_CURVED:
+    if facts[C_S_CURVE] != 0.0 and not bugfix:
         duration = _curved_time(
             steps,
             first,
@@ -213,12 +213,13 @@ def _steps(row: Any, entry: float, leave: float, facts: Any, shape: Any) -> None
             accel,
             rising,
             steps - falling,
+            facts[C_FIRST_STEPS] == 1.0,
             facts[C_TIMER_HZ],
             facts[C_SMOOTHING_HZ],
         )
         flat = falling <= 1.0
     elif facts[C_S_CURVE] != 0.0:
-        # Along the Bezier curve as along the line: the same time and the same way.
+        # bugfix: along the Bezier curve as along the line, the same time and the same way.
         level = max(steps - rising - falling, 0.0)
         first, final = min(first, peak), min(final, peak)
         duration = max((2.0 * peak - first - final) / accel + level / peak, steps / peak)
@@ -233,12 +234,14 @@ def _steps(row: Any, entry: float, leave: float, facts: Any, shape: Any) -> None
             rising,
             steps - falling,
             bugfix,
+            facts[C_FIRST_STEPS] == 1.0,
             facts[C_TIMER_HZ],
             facts[C_SMOOTHING_HZ],
         )
         # Without a step on the ramp the speed jumps to that of the next block.
         flat = falling <= (0.0 if bugfix else 1.0)
-    cruise = 1.0 / _interval(nominal, 1.0, facts[C_TIMER_HZ])
+    fine = parts_of_a_step(nominal, facts[C_SMOOTHING_HZ])
+    cruise = 1.0 / (fine * _interval(nominal, fine, facts[C_TIMER_HZ]))
     _fit(steps, min(first, cruise), cruise, cruise if flat else min(final, cruise), duration, shape)
     for k in range(4):
         shape[k] /= per_mm
@@ -260,17 +263,22 @@ def _step_time(
     rising: float,
     falls_from: float,
     bugfix: bool,
+    counts_first: bool,
     timer_hz: float,
     smoothing_hz: float,
 ) -> float:
-    """Time from the start of a block to its last step."""
-    fine = _parts_of_a_step(nominal, smoothing_hz)
+    """Time from the start of a block to its last step.
+
+    `counts_first`: the first step's time counts as time on the ramp (2.1); in 2.0 it does not, so
+    that the second step takes as long.
+    """
+    fine = parts_of_a_step(nominal, smoothing_hz)
     steps *= fine
     rising *= fine
     falls_from *= fine
     before = _interval(first, fine, timer_hz)
     total = before
-    t_up = 0.5 * before if bugfix else before
+    t_up = 0.5 * before if bugfix else before if counts_first else 0.0
     t_down = 0.5 * before if bugfix else 0.0
     rate = first
     # The releases look at the step just done, bugfix at the one to come.
@@ -306,19 +314,20 @@ def _curved_time(
     accel: float,
     rising: float,
     falls_from: float,
+    counts_first: bool,
     timer_hz: float,
     smoothing_hz: float,
 ) -> float:
-    """Time of a block of the releases with short ramps along Bezier curves, step by step.
+    """Time of a block of the releases with ramps along Bezier curves, step by step.
 
     The curve is entered where the first step, at the entry's speed, has come to: a ramp that is
-    shorter than that is not seen, as without S-curve.
+    shorter than that is not seen, as without S-curve. `counts_first` as for `_step_time`.
     """
-    fine = _parts_of_a_step(nominal, smoothing_hz)
+    fine = parts_of_a_step(nominal, smoothing_hz)
     steps, rising, falls_from = fine * steps, fine * rising, fine * falls_from
     total = _interval(first, fine, timer_hz)
     up_s, down_s = (peak - first) / accel, (peak - final) / accel
-    t = total
+    t = total if counts_first else 0.0
     accelerated = max(min(rising, steps - 1.0), 0.0)
     for _ in range(int(accelerated)):
         wait = _interval(_on_curve(first, peak, t, up_s), fine, timer_hz)
@@ -336,7 +345,7 @@ def _curved_time(
 
 
 @kernel(inline=True)
-def _parts_of_a_step(nominal: float, smoothing_hz: float) -> float:
+def parts_of_a_step(nominal: float, smoothing_hz: float) -> float:
     """Find how many parts of a step ADAPTIVE_STEP_SMOOTHING times for each step."""
     fine = 1.0
     rate = nominal

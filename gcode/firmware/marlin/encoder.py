@@ -31,7 +31,7 @@ from stillpath.gcode.firmware.encoding import (
     limits_in_force,
     to_units,
 )
-from stillpath.gcode.firmware.marlin._block_kernels import C_MIN_RATE
+from stillpath.gcode.firmware.marlin._block_kernels import C_FIRST_STEPS, C_MIN_RATE, L_JERK
 from stillpath.gcode.firmware.marlin._encoder_kernels import (
     Blocks,
     assign_rates,
@@ -155,9 +155,11 @@ class MarlinEncoder:
         if firmware.link == "serial":
             rate = min(rate, firmware.baud_rate / 10.0 / _BYTES_PER_LINE)
         self._rate = rate
-        self._least_hz = float(planner_facts(firmware, corexy=corexy)[C_MIN_RATE])
+        facts = planner_facts(firmware, corexy=corexy)
+        self._least_hz = float(facts[C_MIN_RATE])
         # With classic jerk a move starts at the jerk's speed, without a slow first step.
         self._start_hz = self._least_hz if firmware.junction == "deviation" else np.inf
+        self._first_steps = float(facts[C_FIRST_STEPS])
         self._burst = 0.5 * firmware.block_buffer_size
         low, high = steps_within(travel_mm, self._scale)
         self._lattice = Lattice(
@@ -248,15 +250,17 @@ class MarlinEncoder:
         fastest = np.where(ours, _DIAGONAL * speed_mm_s, speed_mm_s)
         phases = self._plan(start_mm, end_mm, fastest, limits_id, limits)
         actual = phases.lasts_s
-        blocks = Blocks(ours, steps, path, moves.end_s, moves.planned_s, fastest)
+        at_once = self._at_once(start_mm, end_mm, path, limits_id, limits)
+        blocks = Blocks(ours, steps, path, moves.end_s, moves.planned_s, fastest, at_once)
         feedrate, predicted = np.zeros(len(ours)), np.zeros(len(ours))
         for attempt in range(_PASSES):
             assign_rates(
                 blocks,
                 actual,
                 correction,
-                self._firmware.junction == "classic_jerk",
+                self._first_steps,
                 self._firmware.step_timer_hz,
+                self._firmware.step_smoothing_hz,
                 self._least_hz,
                 begin_s,
                 feedrate,
@@ -378,6 +382,24 @@ class MarlinEncoder:
         steps = np.max(motors, axis=1)
         steps = np.where((steps >= least) & (path > 0.0), steps, 0.0)
         return steps, np.where(path > 0.0, path, 1.0)
+
+    def _at_once(
+        self,
+        start_mm: NDArray[np.float64],
+        end_mm: NDArray[np.float64],
+        path_mm: NDArray[np.float64],
+        limits_id: NDArray[np.int32],
+        limits: Sequence[Limits],
+    ) -> NDArray[np.float64]:
+        """Return the speed with which each move may begin: by classic jerk its safe speed, or 0."""
+        if self._firmware.junction != "classic_jerk":
+            return np.zeros(len(path_mm))
+        jerk = np.array([one.as_row()[L_JERK : L_JERK + 4] for one in limits])[limits_id]
+        travel = np.abs(end_mm - start_mm)
+        if self._corexy:
+            x, y = (end_mm - start_mm)[:, :2].T
+            travel[:, 0], travel[:, 1] = np.abs(x + y), np.abs(x - y)
+        return np.asarray(path_mm * np.min(jerk / np.maximum(travel, 1e-9), axis=1))
 
     def _plan(
         self,

@@ -132,4 +132,5 @@ def planner_facts(firmware: Marlin, *, corexy: bool) -> NDArray[np.float64]:
     if family == blocks.BUGFIX:
         facts[blocks.C_MIN_RATE] = 31.0 if firmware.board == "avr" else 1.0
     facts[blocks.C_S_CURVE] = firmware.s_curve
+    facts[blocks.C_FIRST_STEPS] = 2.0 if firmware.variant == "2.0" else 1.0
     return facts
