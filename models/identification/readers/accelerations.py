@@ -15,6 +15,7 @@ from stillpath.models.identification.readers.checks import (
     check_steady,
     sensor_axes,
 )
+from stillpath.models.identification.readers.lost_samples import restored
 from stillpath.models.identification.readers.settings import ReadSettings
 from stillpath.models.identification.readers.tables import MOST_ROWS, Table
 from stillpath.models.identification.types import AccelerationLog
@@ -60,10 +61,11 @@ def read_klipper_log(table: Table, axis: str | None, settings: ReadSettings) -> 
     check_long(table, _LEAST_SAMPLES, "samples", MOST_ROWS)
     values = table.numbers(("time", *_KLIPPER))
     check_steady(values[:, 0], table)
+    time_s, told = restored(values[:, 0])
     accel = values[:, 1:] * _UNITS[settings.acceleration_unit or "mm/s^2"]
     columns = dict(zip("xyz", accel.T, strict=True))
     notes = _notes(columns, table, axis, settings)
-    return AccelerationLog(values[:, 0], accel, axis, table.source, (*table.notes, *notes))
+    return AccelerationLog(time_s, accel, axis, table.source, (*table.notes, *told, *notes))
 
 
 def read_m956(table: Table, axis: str | None, settings: ReadSettings) -> AccelerationLog:
