@@ -119,10 +119,8 @@ def align(
     band_hz = (low_hz, min(low_hz + _BAND_HZ, excitation.f_end_hz))
     _check_length(log, grid_s, excitation, band_hz[1])
     kinds = [_place(kind, grid_s, accel, band_hz) for kind in _kinds(excitation)]
-    found = max(
-        _as_long(kinds, grid_s) or kinds,
-        key=lambda placed: _agreement(placed, accel, rate_hz, low_hz),
-    )
+    likely = _as_long(kinds, grid_s) or kinds
+    found = max(likely, key=lambda placed: _agreement(placed, accel, rate_hz, low_hz))
     profile, start_s, command = found.profile, found.start_s, found.command
     if found.correlation < _LEAST_CORRELATION:
         raise ModelError(_not_found(log, excitation, accel, found.correlation))

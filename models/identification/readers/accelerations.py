@@ -15,6 +15,7 @@ from stillpath.models.identification.readers.checks import (
     check_steady,
     sensor_axes,
 )
+from stillpath.models.identification.readers.lost_samples import restored
 from stillpath.models.identification.readers.settings import ReadSettings
 from stillpath.models.identification.readers.tables import MOST_ROWS, Table
 from stillpath.models.identification.types import AccelerationLog
@@ -23,6 +24,8 @@ __all__ = ["is_klipper_log", "is_m956", "read_klipper_log", "read_m956"]
 
 _UNITS = {"mm/s^2": 1.0, "m/s^2": 1000.0, "g": 9806.65}
 _LEAST_SAMPLES = 64
+_BRIDGED_S = 0.01
+"""A message of the sensor's board, which nobody sends again, has 8 or 10 samples."""
 _NO_TEST = (
     "RepRapFirmware has no resonance test of its own: tell which motion was commanded, or record "
     "command and acceleration together"
@@ -59,11 +62,14 @@ def read_klipper_log(table: Table, axis: str | None, settings: ReadSettings) -> 
             raise _overflowed(table, int(lost[1]))
     check_long(table, _LEAST_SAMPLES, "samples", MOST_ROWS)
     values = table.numbers(("time", *_KLIPPER))
-    check_steady(values[:, 0], table)
+    bridged = check_steady(values[:, 0], table, _BRIDGED_S)
+    time_s, told = restored(values[:, 0])
     accel = values[:, 1:] * _UNITS[settings.acceleration_unit or "mm/s^2"]
     columns = dict(zip("xyz", accel.T, strict=True))
     notes = _notes(columns, table, axis, settings)
-    return AccelerationLog(values[:, 0], accel, axis, table.source, (*table.notes, *notes))
+    return AccelerationLog(
+        time_s, accel, axis, table.source, (*table.notes, *bridged, *told, *notes)
+    )
 
 
 def read_m956(table: Table, axis: str | None, settings: ReadSettings) -> AccelerationLog:

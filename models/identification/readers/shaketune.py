@@ -15,6 +15,7 @@ from stillpath.models.identification.types import AccelerationLog
 
 __all__ = ["is_shaketune", "read_shaketune"]
 
+_PICKLED = re.compile(rb"\x80[\x02-\x05].{0,40}name.{1,120}samples", re.DOTALL)
 _FIRST_LINE = re.compile(rb'\s*\{\s*"name"\s*:\s*"[^"\n]{0,200}"\s*,\s*"samples"\s*:')
 _AXES = {
     "axis_x": "x",
@@ -33,7 +34,7 @@ class _Recording(BaseModel):
 
 def is_shaketune(content: bytes) -> bool:
     """Whether the unpacked content is a recording of Shake&Tune."""
-    return _FIRST_LINE.match(content) is not None
+    return any(kind.match(content) is not None for kind in (_FIRST_LINE, _PICKLED))
 
 
 def read_shaketune(
@@ -54,8 +55,14 @@ def read_shaketune(
     ------
     ModelError
         Naming the line, if it is no recording of a resonance test in the plane, or one that no
-        raw log may be.
+        raw log may be. If it is from a Shake&Tune before 2025-02, whose files are pickles of
+        Python, which are programs.
     """
+    if _PICKLED.match(content):
+        raise ModelError(
+            f"{name}: from a Shake&Tune before 2025-02, in a format that is not safe to read: "
+            "update Shake&Tune and measure again, or measure with TEST_RESONANCES OUTPUT=raw_data"
+        )
     return tuple(
         _read_recording(line, name, number, axis, settings)
         for number, line in enumerate(content.splitlines(), start=1)

@@ -383,6 +383,16 @@ def test_raw_logs_of_a_klipper_before_2024_12() -> None:
     assert not [w for w in found.warnings if "phase" in w]
 
 
+def test_lost_messages_of_a_sensor_do_not_matter() -> None:
+    rows = quick_raw("x").content.splitlines(keepends=True)
+    lost = {at + k for at in range(1000, 15000, 1300) for k in range(4)}
+    content = b"".join(row for i, row in enumerate(rows) if i not in lost)
+    (log,) = read_content(content, "raw_data_x_20260101_120000.csv", settings=SETTINGS)
+    (found,) = identify([Measured(log)], SETTINGS).values()
+    assert main_mode(found) == pytest.approx(42.0, rel=2e-3)
+    assert any("44 samples (0.28%) are missing in 11 gaps" in note for note in found.notes)
+
+
 def test_moving_mass_from_two_raw_logs() -> None:
     found = one(quick_raw("y", loaded(0.0)), quick_raw("y", loaded(0.5), condition="+500g"))
     mass = mass_of(found)

@@ -91,11 +91,24 @@ def test_a_name_that_says_another_axis_is_refused(name: str, says: str) -> None:
 
 def test_gap_says_where_and_how_long() -> None:
     time_s, accel = some_log()
-    keep = np.delete(np.arange(N), np.arange(100, 104))
-    with pytest.raises(ModelError, match=r"line 102: gap in time: 1.56. ms .*4 samples"):
+    keep = np.delete(np.arange(N), np.arange(100, 140))
+    with pytest.raises(ModelError, match=r"line 102: gap in time: 12.8. ms .*40 samples.* 32 may"):
         read(klipper(time_s[keep], accel[keep]))
     one_lost = np.delete(np.arange(N), 100)
     read(klipper(time_s[one_lost], accel[one_lost]))
+
+
+def test_a_few_lost_messages_are_noted_and_many_refused() -> None:
+    time_s, accel = some_log(8000)
+    places = np.arange(500, 8000, 1500)
+    some = np.delete(np.arange(8000), [at + k for at in places for k in range(10)])
+    log = read(klipper(time_s[some], accel[some]))
+    assert isinstance(log, AccelerationLog)
+    assert any("50 samples (0.63%) are missing in 5 gaps" in note for note in log.notes)
+    np.testing.assert_allclose(log.time_s, time_s[some], atol=6e-7)
+    many = np.delete(np.arange(8000), [at + k for at in places for k in range(20)])
+    with pytest.raises(ModelError, match=r"5 gaps in all, 1.27% .* and 1% in all"):
+        read(klipper(time_s[many], accel[many]))
 
 
 def test_time_must_rise() -> None:

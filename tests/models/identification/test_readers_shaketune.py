@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import io
 import json
+import pickle
 
 import numpy as np
 import pytest
@@ -87,6 +88,14 @@ def test_faults_are_named(content: bytes, name: str, says: str) -> None:
     with pytest.raises(ModelError, match=says) as error:
         read_content(content, name, settings=settings)
     assert str(error.value).startswith(name)
+
+
+@pytest.mark.parametrize("protocol", [2, 4, 5])
+def test_recordings_before_2025_02_are_told_to_be_repeated(protocol: int) -> None:
+    """They are pickles, which run whatever somebody put into them."""
+    content = ZstdCompressor().compress(pickle.dumps([recording()], protocol=protocol))
+    with pytest.raises(ModelError, match=r"Shake&Tune before 2025-02.*measure again"):
+        read_content(content, NAME)
 
 
 @pytest.mark.parametrize("pack", [gzip.compress, ZstdCompressor().compress])
