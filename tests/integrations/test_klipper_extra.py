@@ -164,6 +164,45 @@ def test_bad_exports_are_refused(
     assert reason in str(refused.value)
 
 
+class OldStepper:
+    """A motor of X in Klipper before 2023-02, which does not say what it follows."""
+
+    def __init__(self) -> None:
+        self.kinematics: Any = "Klipper's kinematics"
+        self.queue: Any = "Klipper's queue"
+        self.at = 12.5
+
+    def set_stepper_kinematics(self, kinematics: Any) -> Any:
+        before, self.kinematics = self.kinematics, kinematics
+        return before
+
+    def set_trapq(self, queue: Any) -> Any:
+        before, self.queue = self.queue, queue
+        return before
+
+    def calc_position_from_coord(self, coord: tuple[float, ...]) -> float:
+        return coord[0]
+
+    def get_commanded_position(self) -> float:
+        return self.at
+
+    def set_position(self, coord: tuple[float, ...]) -> None:
+        self.at = coord[0]
+
+
+def test_motors_of_an_old_klipper_are_taken_and_given_back(extra: ModuleType) -> None:
+    stepper = OldStepper()
+    library = SimpleNamespace(cartesian_stepper_alloc=lambda _axis: "ours", free=None)
+    ffi = (SimpleNamespace(gc=lambda thing, _free: thing), library)
+    motor = extra.Motor(stepper, ffi, SimpleNamespace(trapq=lambda: "our queue"))
+    motor.engage()
+    assert (stepper.kinematics, stepper.queue, stepper.at) == ("ours", "our queue", 12.5)
+    motor.release()
+    assert stepper.kinematics == "Klipper's kinematics"
+    assert stepper.queue == "Klipper's queue"
+    assert stepper.at == 12.5
+
+
 def installed(*arguments: object) -> subprocess.CompletedProcess[str]:
     command = ["sh", str(EXTRA / "install.sh"), *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, check=False)
