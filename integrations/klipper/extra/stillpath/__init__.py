@@ -22,7 +22,24 @@ from .export import Refused, read_export
 from .motors import Motor, queue_of
 
 KINEMATICS = {"cartesian": "CartKinematics", "corexy": "CoreXYKinematics"}
-ASIDE = ("TEST_RESONANCES", "SHAPER_CALIBRATE", "SET_INPUT_SHAPER", "FORCE_MOVE", "STEPPER_BUZZ")
+SHAKETUNE = (
+    "AXES_MAP_CALIBRATION",
+    "AXES_SHAPER_CALIBRATION",
+    "COMPARE_BELTS_RESPONSES",
+    "CREATE_VIBRATIONS_PROFILE",
+    "EXCITATE_AXIS_AT_FREQ",
+)
+"""Measurements of Shake&Tune: commands, or macros that call them with an underscore before."""
+ASIDE = (
+    "TEST_RESONANCES",
+    "SHAPER_CALIBRATE",
+    "SET_INPUT_SHAPER",
+    "UPDATE_INPUT_SHAPER",  # Creality's
+    "FORCE_MOVE",
+    "STEPPER_BUZZ",
+    *SHAKETUNE,
+    *("_" + name for name in SHAKETUNE),
+)
 """Commands during which the motors follow Klipper's plan itself."""
 # Klipper v0.13.0-631 to -641 ignores SHAPER_FREQ=0.
 SHAPER = (
