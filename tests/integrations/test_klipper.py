@@ -349,6 +349,16 @@ def test_a_part_of_ones_own_pause_is_no_other_macro():
     assert not [line for line in printer.told if "itself" in line]
 
 
+@pytest.mark.parametrize("state", ["printing", "standby"])
+def test_check_in_a_stretch_leaves_the_shaper_off(state: str):
+    printer = in_stretch(OURS)
+    printer.state = state  # OctoPrint's prints are not known to print_stats
+    before = limits(printer)
+    printer.run("STILLPATH_CHECK")
+    assert limits(printer) == before
+    assert before[1] == 0.0
+
+
 def test_check_finds_limits_that_stayed():
     printer = in_stretch(OURS)
     printer.run("STILLPATH_CHECK")
