@@ -245,6 +245,24 @@ def test_lines_of_others_stay(klipper: Path) -> None:
     assert exclude.read_text() == "klippy/extras/led_effect.py\n"
 
 
+@pytest.mark.parametrize(("version", "is_old"), [("Python 2.7.18", True), ("Python 3.9.2", False)])
+def test_the_installer_looks_at_klippers_python(version: str, is_old: bool, tmp_path: Path) -> None:
+    ours, python = tmp_path / "klipper", tmp_path / "klippy-env/bin/python"
+    (ours / "klippy/extras").mkdir(parents=True)
+    (ours / "klippy/klippy.py").touch()
+    python.parent.mkdir(parents=True)
+    # As each of them answers to `-V` and `-c`.
+    python.write_text(f'#!/bin/sh\n[ "$1" = -c ] && exit {int(is_old)}\necho {version}\n')
+    python.chmod(0o755)
+    tried = installed("-k", ours)
+    assert tried.returncode == (2 if is_old else 0)
+    assert (ours / "klippy/extras/stillpath").is_symlink() != is_old
+    if is_old:
+        assert "Klipper runs in Python 2.7.18" in tried.stderr
+        assert "3.7 or later" in tried.stderr
+        assert installed("-u", "-k", ours).returncode == 0
+
+
 def test_the_installer_refuses_what_is_no_klipper(tmp_path: Path, klipper: Path) -> None:
     nowhere = installed("-k", tmp_path / "nothing")
     assert nowhere.returncode == 2
