@@ -65,12 +65,16 @@ def load_config(config):
     if what == "measurement":
         for name in ("AXES_SHAPER_CALIBRATION", "_COMPARE_BELTS_RESPONSES"):
             printer.lookup_object("gcode").register_command(name, measure)
+    def reset(gcmd):
+        printer.lookup_object("toolhead").square_corner_velocity = 5.0
+    if what == "Kalico":
+        printer.lookup_object("gcode").register_command("RESET_VELOCITY_LIMIT", reset)
     printer.register_event_handler("klippy:ready", ready)
     return ready
 """
 """An extra of Klipper that makes trouble: computing takes .7 s for each s; the plan is taken for
 known .5 s further than Klipper promises, so that moves come late; X's endstop raises once. Or it
-moves the head as Shake&Tune does while it measures."""
+moves the head as Shake&Tune does while it measures; or it has Kalico's RESET_VELOCITY_LIMIT."""
 WATCH = """
 import gc, logging, tracemalloc
 def load_config(config):
@@ -157,6 +161,22 @@ def test_it_stands_aside_while_shaketune_measures(
     log = (tmp_path / "klippy.log").read_text()
     assert re.findall(r"measured: (\w+)", log) == ["off", "off"]
     assert "stillpath: on for ender3" in log
+
+
+def test_kalicos_reset_of_the_limits_ends_a_compensated_stretch(
+    troubled: Path, export: Export, tmp_path: Path
+) -> None:
+    machine = homed(load_machine("ender3"))
+    move = "G1 X{} Y60 F9000\n"
+    text = "G28\nG90\nSET_VELOCITY_LIMIT SQUARE_CORNER_VELOCITY=14.8300005\n" + move.format(60)
+    text += "M400\nSTILLPATH_STATUS\nRESET_VELOCITY_LIMIT\n" + move.format(20)
+    more = "[trouble]\nwhat: Kalico\n"
+    text += "M400\nSTILLPATH_STATUS\n"
+    print_with(text, machine, export("ender3"), tmp_path, troubled, more)
+    log = (tmp_path / "klippy.log").read_text()
+    stretch_s, behind_s = map(float, re.findall(r"limited ([\d.]+) s", log))
+    assert stretch_s > 0.2
+    assert behind_s < stretch_s + 0.2
 
 
 def troubled_pair(

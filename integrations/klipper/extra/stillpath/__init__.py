@@ -160,6 +160,7 @@ class Stillpath:
         for name in ASIDE:
             self._wrap(name, self._standing_aside)
         self._wrap("SET_VELOCITY_LIMIT", self._set_limits)
+        self._wrap("RESET_VELOCITY_LIMIT", self._reset_limits)  # Kalico's
 
     def _wrap(self, name, function):
         """Let `function` be called with the command that there is, and what it is given."""
@@ -172,11 +173,17 @@ class Stillpath:
         corner = gcmd.get_float("SQUARE_CORNER_VELOCITY", None)
         if corner is not None:
             # The mark of compensated stretches, as stillpath.cfg reads it.
-            in_stream = round(corner * 1e7) % 10 == 5
-            if in_stream != self.in_stream:
-                self.toolhead.get_last_move_time()  # moves that wait are planned as they came
-                self.in_stream = in_stream
+            self._note_stream(round(corner * 1e7) % 10 == 5)
         return plain(gcmd)
+
+    def _reset_limits(self, plain, gcmd):
+        self._note_stream(False)
+        return plain(gcmd)
+
+    def _note_stream(self, in_stream):
+        if in_stream != self.in_stream:
+            self.toolhead.get_last_move_time()  # moves that wait are planned as they came
+            self.in_stream = in_stream
 
     # -- on and off
 
