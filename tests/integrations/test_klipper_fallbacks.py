@@ -169,9 +169,9 @@ def test_kalicos_reset_of_the_limits_ends_a_compensated_stretch(
     machine = homed(load_machine("ender3"))
     move = "G1 X{} Y60 F9000\n"
     text = "G28\nG90\nSET_VELOCITY_LIMIT SQUARE_CORNER_VELOCITY=14.8300005\n" + move.format(60)
-    text += "M400\nSTILLPATH_STATUS\nRESET_VELOCITY_LIMIT\n" + move.format(20)
-    more = "[trouble]\nwhat: Kalico\n"
-    text += "M400\nSTILLPATH_STATUS\n"
+    text += "SET_KINEMATIC_POSITION\nSTILLPATH_STATUS\nRESET_VELOCITY_LIMIT\n" + move.format(20)
+    more = MORE + "[trouble]\nwhat: Kalico\n"
+    text += "SET_KINEMATIC_POSITION\nSTILLPATH_STATUS\n"
     print_with(text, machine, export("ender3"), tmp_path, troubled, more)
     log = (tmp_path / "klippy.log").read_text()
     stretch_s, behind_s = map(float, re.findall(r"limited ([\d.]+) s", log))
