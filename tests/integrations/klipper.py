@@ -165,7 +165,7 @@ class Klipper:
         objects: dict[str, Any] = {
             "configfile": {
                 "settings": self.settings,
-                "config": {section: {} for section, _ in self.sections},
+                "config": dict(self.sections),
             },
             "toolhead": self.toolhead,
             "pause_resume": {"is_paused": self.is_paused},

@@ -124,12 +124,22 @@ class Chelper:
     get_ffi = staticmethod(lambda: (ffi, Library()))
 klippy.extras.input_shaper.chelper = Chelper
 """
-# A checkout's modules import each other by their plain names. In batch mode, and only there, it
-# comes to rest wherever it has read all of a block of the file: here it waits for the next block.
+# A checkout's modules import each other by their plain names, Kalico's are a package. In batch
+# mode, and only there, Klipper since 2025-09 comes to rest wherever it has read all of a block of
+# the file: here it waits for the next block.
 _START_CHECKOUT = """
 import os, struct, sys, time
-sys.path.insert(0, sys.argv.pop(1))
-import serialhdl, stepper
+folder = sys.argv.pop(1)
+if os.path.exists(os.path.join(folder, "printer.py")):
+    sys.path.insert(0, os.path.dirname(folder))
+    from klippy import serialhdl, stepper, toolhead
+    from klippy.kinematics import extruder
+    from klippy.printer import main
+else:
+    sys.path.insert(0, folder)
+    import serialhdl, stepper, toolhead
+    from kinematics import extruder
+    from klippy import main
 stepper.MAX_STEPCOMPRESS_ERROR = 1e-6
 plain = serialhdl.SerialReader.disconnect
 def disconnect(self):
@@ -138,9 +148,11 @@ def disconnect(self):
         time.sleep(0.5)
     plain(self)
 serialhdl.SerialReader.disconnect = disconnect
-import toolhead
-from kinematics import extruder
-from extras.motion_queuing import PrinterMotionQueuing
+try:
+    from extras.motion_queuing import PrinterMotionQueuing
+except ImportError:
+    class PrinterMotionQueuing:
+        pass
 def flush(self, eventtime):
     while self.last_step_gen_time < self.need_flush_time - 1.5:
         self._advance_flush_time(0.0, self.last_step_gen_time + 0.25)
@@ -168,10 +180,6 @@ recording(extruder.PrinterExtruder, 1)
 _MAIN = """
 from klippy.klippy import main
 main()
-"""
-_MAIN_CHECKOUT = """
-import klippy
-klippy.main()
 """
 _NO_SHAPER = "[gcode_macro SET_INPUT_SHAPER]\ngcode:\n  M400"
 _IDENTIFY = {0: "identify_response offset=%u data=%.*s", 1: "identify offset=%u count=%c"}
@@ -302,9 +310,8 @@ def steps_of(gcode: str, config: str, place: Path, klipper: Path | None = None) 
     if klipper is not None:
         environment["PYTHONPATH"] = str(klipper)
         if CHECKOUT is not None:
-            start = ["-c", _START_CHECKOUT + _RECORD + _MAIN_CHECKOUT, str(klipper / "klippy")]
-            config = config.replace("\nmax_stepper_error: 0.000001", "")
-            config = re.sub("max_accel_to_decel: .*", "minimum_cruise_ratio: 0.5", config)
+            start = ["-c", _START_CHECKOUT + _RECORD + "main()\n", str(klipper / "klippy")]
+            config = _as_known(config, klipper / "klippy")
             (place / "printer.cfg").write_text(config, encoding="utf-8")
     command = [PYTHON, *start, "printer.cfg", "-i", "host.gcode", "-o", "out.serial"]
     done = subprocess.run(
@@ -321,6 +328,17 @@ def steps_of(gcode: str, config: str, place: Path, klipper: Path | None = None) 
     # M205 and the like are Marlin's; words would be macros that are missing.
     assert not re.search('Unknown command:"[A-Z]{2}', log), log[-4000:]
     return _read((place / "out.serial").read_bytes())
+
+
+def _as_known(config: str, klippy: Path) -> str:
+    """Leave out of printer.cfg what a checkout of that age does not know."""
+    if "max_stepper_error" not in (klippy / "mcu.py").read_text():
+        config = config.replace("\nmax_stepper_error: 0.000001", "")
+    if "minimum_cruise_ratio" in (klippy / "toolhead.py").read_text():
+        config = re.sub("max_accel_to_decel: .*", "minimum_cruise_ratio: 0.5", config)
+    if not (klippy / "extras" / "exclude_object.py").exists():
+        config = config.replace("\n[exclude_object]", "")
+    return config
 
 
 def _dictionary() -> dict[str, object]:

@@ -40,6 +40,17 @@ gcode:
   G1 X0 Y0 F9000
   CANCEL_PRINT_BASE
 """
+FIRST_FLOOR = """
+[gcode_macro FIRST_FLOOR_PAUSE]
+gcode:
+  PAUSE_BASE
+  G1 X5 Y5 F30000
+[gcode_macro FIRST_FLOOR_RESUME]
+gcode:
+  G1 E3 F2100
+  RESUME_BASE {get_params}
+"""
+"""Of Creality's printers, in short: they call what PAUSE and RESUME rename."""
 CHANGES = """
 [gcode_macro M600]
 gcode:
@@ -302,6 +313,50 @@ def test_check_finds_a_wrapper_that_was_cut_out(shows_commands: bool):
     printer = Klipper(macros_of(text), shows_commands=shows_commands)
     printer.run("STILLPATH_CHECK")
     assert [line for line in printer.told if line.startswith("Stillpath: CANCEL_PRINT does not")]
+
+
+def test_check_finds_macros_that_pass_by_the_wrappers():
+    printer = Klipper(macros_of(USERS, FIRST_FLOOR, OURS))
+    printer.run("STILLPATH_CHECK")
+    found = [line for line in printer.told if "itself" in line]
+    assert [re.findall("[A-Z]+_[A-Z_]+", line) for line in found] == [
+        ["FIRST_FLOOR_PAUSE", "PAUSE_BASE", "STILLPATH_RESTORE"],
+        ["FIRST_FLOOR_RESUME", "RESUME_BASE", "STILLPATH_CONTINUE"],
+    ]
+    printer.run("STILLPATH_CHECK STOP=1")  # a print starts all the same
+
+
+def test_macros_that_pass_by_the_wrappers_can_be_mended():
+    pauses = FIRST_FLOOR.replace("  PAUSE", "  STILLPATH_RESTORE REMEMBER=1\n  PAUSE")
+    mended = pauses.replace("{get_params}", "\n  STILLPATH_CONTINUE")
+    printer = in_stretch(USERS, mended, OURS)
+    before = limits(printer)
+    printer.run("FIRST_FLOOR_PAUSE")
+    assert printer.sent == [OWN_LIMITS, OWN_SHAPER, "PAUSE", "G1 X5 Y5 F30000"]
+    printer.run("FIRST_FLOOR_RESUME")
+    assert limits(printer) == before
+    printer.told.clear()
+    printer.run("STILLPATH_CHECK")
+    assert not [line for line in printer.told if "itself" in line]
+
+
+def test_a_part_of_ones_own_pause_is_no_other_macro():
+    parts = (
+        USERS.replace("  PAUSE_BASE\n", "  _PARK\n") + "[gcode_macro _PARK]\ngcode:\n  PAUSE_BASE\n"
+    )
+    printer = Klipper(macros_of(parts, OURS))
+    printer.run("STILLPATH_CHECK")
+    assert not [line for line in printer.told if "itself" in line]
+
+
+@pytest.mark.parametrize("state", ["printing", "standby"])
+def test_check_in_a_stretch_leaves_the_shaper_off(state: str):
+    printer = in_stretch(OURS)
+    printer.state = state  # OctoPrint's prints are not known to print_stats
+    before = limits(printer)
+    printer.run("STILLPATH_CHECK")
+    assert limits(printer) == before
+    assert before[1] == 0.0
 
 
 def test_check_finds_limits_that_stayed():

@@ -164,6 +164,45 @@ def test_bad_exports_are_refused(
     assert reason in str(refused.value)
 
 
+class OldStepper:
+    """A motor of X in Klipper before 2023-02, which does not say what it follows."""
+
+    def __init__(self) -> None:
+        self.kinematics: Any = "Klipper's kinematics"
+        self.queue: Any = "Klipper's queue"
+        self.at = 12.5
+
+    def set_stepper_kinematics(self, kinematics: Any) -> Any:
+        before, self.kinematics = self.kinematics, kinematics
+        return before
+
+    def set_trapq(self, queue: Any) -> Any:
+        before, self.queue = self.queue, queue
+        return before
+
+    def calc_position_from_coord(self, coord: tuple[float, ...]) -> float:
+        return coord[0]
+
+    def get_commanded_position(self) -> float:
+        return self.at
+
+    def set_position(self, coord: tuple[float, ...]) -> None:
+        self.at = coord[0]
+
+
+def test_motors_of_an_old_klipper_are_taken_and_given_back(extra: ModuleType) -> None:
+    stepper = OldStepper()
+    library = SimpleNamespace(cartesian_stepper_alloc=lambda _axis: "ours", free=None)
+    ffi = (SimpleNamespace(gc=lambda thing, _free: thing), library)
+    motor = extra.Motor(stepper, ffi, SimpleNamespace(trapq=lambda: "our queue"))
+    motor.engage()
+    assert (stepper.kinematics, stepper.queue, stepper.at) == ("ours", "our queue", 12.5)
+    motor.release()
+    assert stepper.kinematics == "Klipper's kinematics"
+    assert stepper.queue == "Klipper's queue"
+    assert stepper.at == 12.5
+
+
 def installed(*arguments: object) -> subprocess.CompletedProcess[str]:
     command = ["sh", str(EXTRA / "install.sh"), *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, check=False)
@@ -204,6 +243,24 @@ def test_lines_of_others_stay(klipper: Path) -> None:
     assert "klippy/extras/stillpath\n" in exclude.read_text()
     installed("-u", "-k", klipper)
     assert exclude.read_text() == "klippy/extras/led_effect.py\n"
+
+
+@pytest.mark.parametrize(("version", "is_old"), [("Python 2.7.18", True), ("Python 3.9.2", False)])
+def test_the_installer_looks_at_klippers_python(version: str, is_old: bool, tmp_path: Path) -> None:
+    ours, python = tmp_path / "klipper", tmp_path / "klippy-env/bin/python"
+    (ours / "klippy/extras").mkdir(parents=True)
+    (ours / "klippy/klippy.py").touch()
+    python.parent.mkdir(parents=True)
+    # As each of them answers to `-V` and `-c`.
+    python.write_text(f'#!/bin/sh\n[ "$1" = -c ] && exit {int(is_old)}\necho {version}\n')
+    python.chmod(0o755)
+    tried = installed("-k", ours)
+    assert tried.returncode == (2 if is_old else 0)
+    assert (ours / "klippy/extras/stillpath").is_symlink() != is_old
+    if is_old:
+        assert "Klipper runs in Python 2.7.18" in tried.stderr
+        assert "3.7 or later" in tried.stderr
+        assert installed("-u", "-k", ours).returncode == 0
 
 
 def test_the_installer_refuses_what_is_no_klipper(tmp_path: Path, klipper: Path) -> None:

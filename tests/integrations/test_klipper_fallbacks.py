@@ -58,11 +58,23 @@ def load_config(config):
                     del endstop.home_start
                 gcode.is_fileinput = True
             gcode.register_command("FAIL_TO_HOME", home)
+    def measure(gcmd):
+        extra, toolhead = printer.lookup_object("stillpath"), printer.lookup_object("toolhead")
+        toolhead.manual_move([60.0], 150.0)
+        gcmd.respond_info("measured: %s" % (extra.get_status(0.0)["state"],))
+    if what == "measurement":
+        for name in ("AXES_SHAPER_CALIBRATION", "_COMPARE_BELTS_RESPONSES"):
+            printer.lookup_object("gcode").register_command(name, measure)
+    def reset(gcmd):
+        printer.lookup_object("toolhead").square_corner_velocity = 5.0
+    if what == "Kalico":
+        printer.lookup_object("gcode").register_command("RESET_VELOCITY_LIMIT", reset)
     printer.register_event_handler("klippy:ready", ready)
     return ready
 """
 """An extra of Klipper that makes trouble: computing takes .7 s for each s; the plan is taken for
-known .5 s further than Klipper promises, so that moves come late; X's endstop raises once."""
+known .5 s further than Klipper promises, so that moves come late; X's endstop raises once. Or it
+moves the head as Shake&Tune does while it measures; or it has Kalico's RESET_VELOCITY_LIMIT."""
 WATCH = """
 import gc, logging, tracemalloc
 def load_config(config):
@@ -137,6 +149,34 @@ def test_an_endstop_that_raises_does_not_leave_it_off(
     assert log.count("the endstop does not answer") == 2
     assert "Traceback" not in log
     assert re.findall(r"stillpath: (\w+) for ender3", log) == ["on", "on"]
+
+
+def test_it_stands_aside_while_shaketune_measures(
+    troubled: Path, export: Export, tmp_path: Path
+) -> None:
+    machine = homed(load_machine("ender3"))
+    text = "G28\nAXES_SHAPER_CALIBRATION\n_COMPARE_BELTS_RESPONSES\nSTILLPATH_STATUS\n"
+    more = "[trouble]\nwhat: measurement\n"
+    print_with(text, machine, export("ender3"), tmp_path, troubled, more)
+    log = (tmp_path / "klippy.log").read_text()
+    assert re.findall(r"measured: (\w+)", log) == ["off", "off"]
+    assert "stillpath: on for ender3" in log
+
+
+def test_kalicos_reset_of_the_limits_ends_a_compensated_stretch(
+    troubled: Path, export: Export, tmp_path: Path
+) -> None:
+    machine = homed(load_machine("ender3"))
+    move = "G1 X{} Y60 F9000\n"
+    text = "G28\nG90\nSET_VELOCITY_LIMIT SQUARE_CORNER_VELOCITY=14.8300005\n" + move.format(60)
+    text += "SET_KINEMATIC_POSITION\nSTILLPATH_STATUS\nRESET_VELOCITY_LIMIT\n" + move.format(20)
+    more = MORE + "[trouble]\nwhat: Kalico\n"
+    text += "SET_KINEMATIC_POSITION\nSTILLPATH_STATUS\n"
+    print_with(text, machine, export("ender3"), tmp_path, troubled, more)
+    log = (tmp_path / "klippy.log").read_text()
+    stretch_s, behind_s = map(float, re.findall(r"limited ([\d.]+) s", log))
+    assert stretch_s > 0.2
+    assert behind_s < stretch_s + 0.2
 
 
 def troubled_pair(

@@ -43,6 +43,12 @@ if [ -n "$remove" ]; then
     echo "Take the section [stillpath] out of printer.cfg, then restart Klipper."
     exit 0
 fi
+# In an older Python Klipper does not start with the section [stillpath]. Many have 2.7 still.
+python=$(dirname -- "$(cd "$klipper" && pwd -P)")/klippy-env/bin/python
+if [ -x "$python" ] && ! "$python" -c 'import sys; sys.exit(sys.version_info < (3, 7))'; then
+    fail "Klipper runs in $("$python" -V 2>&1) ($python), and the extra needs Python 3.7 or later: \
+make klippy-env again with it, or print compensated files"
+fi
 if [ -L "$link" ] && [ "$(readlink "$link")" = "$here/stillpath" ]; then
     echo "Nothing to do: $link is there"
 else

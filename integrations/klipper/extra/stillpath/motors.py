@@ -37,9 +37,11 @@ class Motor:
         """Follow the own queue; steps are counted on from where they are."""
         stepper = self.stepper
         at = stepper.get_commanded_position()
-        self.klippers = (stepper.get_stepper_kinematics(), stepper.get_trapq())
-        stepper.set_stepper_kinematics(self.kinematics)
-        stepper.set_trapq(self.trapq)
+        # What was set before is the answer; Klipper before 2023-02 has no other way to ask for it.
+        self.klippers = (
+            stepper.set_stepper_kinematics(self.kinematics),
+            stepper.set_trapq(self.trapq),
+        )
         stepper.set_position((at, 0.0, 0.0))
         # Klipper sets positions in coordinates of the nozzle.
         plain = stepper.set_position
@@ -166,5 +168,8 @@ def queue_of(printer, toolhead, ffi):
     if queuing is not None:
         missing += lacking(toolhead, ["_handle_step_flush"])
     if missing:
-        raise Refused("this Klipper is not known: no %s" % (", ".join(missing),))
+        raise Refused(
+            "this Klipper is not known (no %s): update it, or print compensated files"
+            % (", ".join(missing),)
+        )
     return kind(toolhead, queuing, ffi)
