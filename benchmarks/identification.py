@@ -32,7 +32,7 @@ from readback import (
 
 from stillpath.applications.identification.run import InputFile, identify_files
 from stillpath.models.identification.identify import Measured, identify
-from stillpath.models.identification.readers import excitation_for, read_measurements
+from stillpath.models.identification.readers import ReadSettings, excitation_for, read_measurements
 from stillpath.models.identification.shaper_choice import choose_shaper_of
 from stillpath.models.identification.spectrum_fit import explanations
 from stillpath.models.identification.synthetic import (
@@ -224,9 +224,11 @@ def _identified(truth: Machine, kind: str, rng: np.random.Generator) -> Machine:
                 files.append(InputFile(path.name, path.read_bytes()))
             else:
                 measured.append(Measured(simulate_spectrum(plants, test, rng=rng)))
+    # The sensor feels what prints: no mode of these plants is a frame's on its feet.
+    firm = ReadSettings(frame_firm=True)
     if kind == "raw":
-        return identify_files(files, truth, name="identified").machine
-    found = identify(measured)
+        return identify_files(files, truth, firm, name="identified").machine
+    found = identify(measured, firm)
     document = truth.model_dump()
     document["axes"] |= {axis: one.plants.model_dump() for axis, one in found.items()}
     return Machine.model_validate({**document, "name": "identified"})
