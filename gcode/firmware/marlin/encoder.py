@@ -372,10 +372,7 @@ class MarlinEncoder:
         """Return step events and length of every move's block, as in the planner."""
         travel = np.round(end_mm * self._scale) - np.round(start_mm * self._scale)
         x_mm, y_mm, z_mm, e_mm = (travel / self._scale).T
-        motors = np.abs(travel)
-        if self._corexy:
-            motors[:, 0] = np.abs(travel[:, 0] + travel[:, 1])
-            motors[:, 1] = np.abs(travel[:, 0] - travel[:, 1])
+        motors = self._motors(travel)
         least = self._firmware.min_steps_per_segment
         path = np.sqrt(x_mm**2 + y_mm**2 + z_mm**2)
         path = np.where(np.max(motors[:, :3], axis=1) >= least, path, np.abs(e_mm))
@@ -395,11 +392,16 @@ class MarlinEncoder:
         if self._firmware.junction != "classic_jerk":
             return np.zeros(len(path_mm))
         jerk = np.array([one.as_row()[L_JERK : L_JERK + 4] for one in limits])[limits_id]
-        travel = np.abs(end_mm - start_mm)
+        motors = self._motors(end_mm - start_mm)
+        return np.asarray(path_mm * np.min(jerk / np.maximum(motors, 1e-9), axis=1))
+
+    def _motors(self, travel: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how far each motor turns for a travel, (n, 4), in its unit."""
+        motors = np.abs(travel)
         if self._corexy:
-            x, y = (end_mm - start_mm)[:, :2].T
-            travel[:, 0], travel[:, 1] = np.abs(x + y), np.abs(x - y)
-        return np.asarray(path_mm * np.min(jerk / np.maximum(travel, 1e-9), axis=1))
+            x, y = travel[:, :2].T
+            motors[:, 0], motors[:, 1] = np.abs(x + y), np.abs(x - y)
+        return motors
 
     def _plan(
         self,
