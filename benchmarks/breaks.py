@@ -41,6 +41,7 @@ from stillpath.pipeline.options import Options
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from tests.e2e.round_trip import corpus_files, corpus_folder, made_to_fit, text_of
+from tests.gcode.marlin_interrupts import stepped
 
 FILES = ("cura_ender3_gear24", "klipper_excludeobj_multi")
 MACHINES = ("ender3", "voron-v24-250")
@@ -56,11 +57,31 @@ _AROUND = 60
 def velocity_step(moves: Moves, limits: list[Limits], machine: Machine) -> float:
     """Largest change of a motor's speed within a ms when moves go from rest to rest, mm/s.
 
-    Of an axis that bears more, the same share of what it bears.
+    Of an axis that bears more, the same share of what it bears. Marlin's by its steps.
     """
+    if machine.firmware.kind == "marlin":
+        t_s, place_mm = stepped(
+            moves, limits, machine.firmware, corexy=machine.kinematics == "corexy"
+        )
+        sampled_s = np.arange(-_REACH, t_s[-1] / _SAMPLE_S + _REACH) * _SAMPLE_S
+        place = np.stack([np.interp(sampled_s, t_s, row) for row in place_mm])
+    else:
+        place = planned(moves, limits, machine)
+    velocity = np.diff(place, axis=1) / _SAMPLE_S
+    change = velocity[:, _REACH:] - velocity[:, :-_REACH]
+    if machine.kinematics == "corexy":
+        change = np.stack([change[0] + change[1], change[0] - change[1]])
+    least = machine.command.speed_step_mm_s
+    for row, axis in zip(change, ("x", "y"), strict=True):
+        row *= least / machine.command.of(axis).speed_step_mm_s
+    return float(np.max(np.abs(change), initial=0.0))
+
+
+def planned(moves: Moves, limits: list[Limits], machine: Machine) -> NDArray[np.float64]:
+    """X and Y of moves from rest to rest every `_SAMPLE_S`, mm, shape (2, n)."""
     phases = plan_moves(moves, limits, machine)
     if not len(phases):
-        return 0.0
+        return np.zeros((2, 0))
     # RepRapFirmware holds moves back by some hundredths of a ms where they come too fast: late
     # steps, which this does not count.
     lasts_s = phases.lasts_s
@@ -69,14 +90,7 @@ def velocity_step(moves: Moves, limits: list[Limits], machine: Machine) -> float
     count = int((ends_s[-1] - ends_s[0] + lasts_s[0]) / _SAMPLE_S) + 2 * _REACH
     begin_s = float(phases.t_s[0]) - _REACH * _SAMPLE_S
     place, _ = sample_phases(phases, (begin_s, _SAMPLE_S, count))
-    velocity = np.diff(place[:2], axis=1) / _SAMPLE_S
-    change = velocity[:, _REACH:] - velocity[:, :-_REACH]
-    if machine.kinematics == "corexy":
-        change = np.stack([change[0] + change[1], change[0] - change[1]])
-    least = machine.command.speed_step_mm_s
-    for row, axis in zip(change, ("x", "y"), strict=True):
-        row *= least / machine.command.of(axis).speed_step_mm_s
-    return float(np.max(np.abs(change), initial=0.0))
+    return place[:2]
 
 
 def steps_at_breaks(written: Path, machine: Machine, breaks: int) -> NDArray[np.float64]:

@@ -30,6 +30,7 @@ from stillpath.gcode.firmware.planning import join_phases
 from stillpath.gcode.types import Moves, Phases, rows_of
 from stillpath.models.firmware import Marlin
 from stillpath.models.firmware.marlin import PerAxis
+from tests.gcode.marlin_interrupts import Ramps, waits_s
 
 SCALE = (80.0, 80.0, 400.0, 100.0)
 MACHINES = st.builds(
@@ -171,47 +172,6 @@ def test_the_queue_settles_like_a_ring_of_blocks(n: int, seed: int, size: int) -
     assert entry2 == pytest.approx(expected, rel=1e-9)
 
 
-def interrupts(
-    steps: int,
-    first: float,
-    nominal: float,
-    final: float,
-    accel: float,
-    rising: int,
-    falls_from: int,
-    bugfix: bool,
-    counts_first: bool,
-    fine: int,
-) -> float:
-    """Time of a block, interrupt by interrupt (stepper.cpp, `block_phase_isr`), 2 MHz."""
-
-    def ticks(rate: float) -> float:
-        return math.floor(2e6 / (rate * fine)) / 2e6
-
-    steps, rising, falls_from = steps * fine, rising * fine, falls_from * fine
-    wait = ticks(first)
-    total, done, accelerated, cruised = wait, 1, first, False
-    t_up = 0.5 * wait if bugfix else wait * counts_first
-    t_down = 0.5 * wait if bugfix else 0.0
-    while done < steps:
-        if done < rising if bugfix else done <= rising:
-            accelerated = min(first + accel * t_up, nominal)
-            wait = ticks(accelerated)
-            t_up += wait
-            t_down = 0.0
-        elif done >= falls_from if bugfix else done > falls_from:
-            rate = max(accelerated - accel * t_down, final)
-            wait = ticks(rate)
-            t_down += wait
-        else:
-            wait = ticks(nominal)
-            if bugfix and not cruised:
-                t_down, accelerated, cruised = 0.5 * wait, nominal, True
-        total += wait
-        done += 1
-    return total
-
-
 @given(
     st.integers(1, 2500),
     st.floats(3.5, 8.0),
@@ -247,9 +207,8 @@ def test_step_times_are_those_of_the_interrupts(
     while nominal * fine * 2 < smoothing_hz:
         fine *= 2
     falls_from = steps - falling
-    expected = interrupts(
-        steps, first, nominal, final, accel, rising, falls_from, bugfix, counts_first, fine
-    )
+    ramps = Ramps(steps, first, nominal, final, accel, rising, falls_from, fine)
+    expected = sum(waits_s(ramps, bugfix=bugfix, counts_first=counts_first))
     found = _step_time(
         float(steps),
         first,

@@ -17,8 +17,10 @@ from numpy.typing import NDArray
 from stillpath.gcode.firmware.marlin.limits import initial_limits
 from stillpath.gcode.firmware.marlin.planner import Planner
 from stillpath.gcode.firmware.planning import join_phases
+from stillpath.gcode.types import Limits
 from stillpath.models.firmware import Marlin
 from stillpath.models.firmware.marlin import PerAxis
+from tests.gcode.marlin_interrupts import stepped
 from tests.gcode.test_marlin_planner import moves_through
 
 FIRMWARE = Marlin(steps_per_mm=PerAxis(x=80.0, y=80.0, z=400.0, e=93.0))
@@ -79,8 +81,15 @@ def test_moves_that_speed_up_and_slow_down(variant: Any, s_curve: bool) -> None:
     limits = {f"{kind}_accel_mm_s2": 5000.0 for kind in ("print", "travel")}
     limits |= {"accel_x_mm_s2": 5000.0, "junction_deviation_mm": 0.05}
     firmware = FIRMWARE.model_copy(update={"variant": variant, "s_curve": s_curve})
-    found = lasts_ms(np.column_stack([steps, 0 * steps, 0 * steps]), speed, firmware, **limits)
+    points = np.column_stack([steps, 0 * steps, 0 * steps])
+    found = lasts_ms(points, speed, firmware, **limits)
     assert found == pytest.approx(RAMPS[variant, s_curve], abs=0.01)
+    if not s_curve:
+        table: list[Limits] = [replace(initial_limits(FIRMWARE), min_segment_time_us=0.0, **limits)]
+        moves = moves_through(points / 80.0, speed)
+        t_s, place_mm = stepped(moves, table, firmware, corexy=False)
+        ends_s = t_s[np.isin(np.round(80.0 * place_mm[0], 6), steps)]
+        assert np.diff(1e3 * ends_s) == pytest.approx(RAMPS[variant, s_curve], abs=0.01)
 
 
 def test_parts_of_steps() -> None:
