@@ -4,7 +4,8 @@ For each file, machine and firmware the written file is read back with its own l
 hundred of its stream's lines the motion breaks off: the firmware brakes to a stand by its own
 rules, and goes on from there. The table gives the largest change of a motor's speed within a ms
 around all breaks, at some speed factors (M220), beside what the machine says its motors bear, and
-the share of breaks at which it is more than a tenth above that (at M220 100 %);
+the share of breaks at which it is more than a tenth above that (at M220 100 %), and the largest
+of the file as sliced;
 and the report's contour error of one model (a prediction), print time, segments a second and put
 back pieces, for comparison with streams that ran under other limits.
 
@@ -54,10 +55,13 @@ _AROUND = 60
 """Moves that are looked at before and after a break."""
 
 
-def velocity_step(moves: Moves, limits: list[Limits], machine: Machine) -> float:
+def velocity_step(
+    moves: Moves, limits: list[Limits], machine: Machine, *, stop: bool = False
+) -> float:
     """Largest change of a motor's speed within a ms when moves go from rest to rest, mm/s.
 
-    Of an axis that bears more, the same share of what it bears. Marlin's by its steps.
+    Of an axis that bears more, the same share of what it bears. Marlin's by its steps. `stop`: in
+    the second half alone, because the start is none of the print's.
     """
     if machine.firmware.kind == "marlin":
         t_s, place_mm = stepped(
@@ -74,6 +78,8 @@ def velocity_step(moves: Moves, limits: list[Limits], machine: Machine) -> float
     least = machine.command.speed_step_mm_s
     for row, axis in zip(change, ("x", "y"), strict=True):
         row *= least / machine.command.of(axis).speed_step_mm_s
+    if stop:
+        change = change[:, change.shape[1] // 2 :]
     return float(np.max(np.abs(change), initial=0.0))
 
 
@@ -93,8 +99,13 @@ def planned(moves: Moves, limits: list[Limits], machine: Machine) -> NDArray[np.
     return place[:2]
 
 
-def steps_at_breaks(written: Path, machine: Machine, breaks: int) -> NDArray[np.float64]:
-    """Largest change of velocity around each break of a written file, shape (factors, breaks)."""
+def steps_at_breaks(
+    written: Path, machine: Machine, breaks: int, *, sliced: bool = False
+) -> NDArray[np.float64]:
+    """Largest change of velocity around each break of a written file, shape (factors, breaks).
+
+    `sliced`: of a file as sliced, at any of its lines.
+    """
     firmware = adapter(machine)
     stream = firmware.stream_limits(firmware.initial_limits()).as_row()
     rng = np.random.default_rng(20261124)
@@ -107,7 +118,9 @@ def steps_at_breaks(written: Path, machine: Machine, breaks: int) -> NDArray[np.
     blocks += reader.flush()
     ours = [
         np.flatnonzero(
-            np.array([x.as_row()[mark] == stream[mark] for x in b.limits])[b.moves.limits_id]
+            np.array([sliced or x.as_row()[mark] == stream[mark] for x in b.limits])[
+                b.moves.limits_id
+            ]
         )
         if len(b.moves)
         else np.zeros(0, int)
@@ -123,11 +136,13 @@ def steps_at_breaks(written: Path, machine: Machine, breaks: int) -> NDArray[np.
             behind = np.searchsorted(jumps, k, side="right")
             low, high = int(jumps[behind - 1]), int(jumps[behind])
             worst = [0.0] * len(FACTORS)
-            for part in (slice(max(k - _AROUND, low), k), slice(k, min(k + _AROUND, high))):
+            for stop in (True, False):
+                part = slice(max(k - _AROUND, low), k) if stop else slice(k, min(k + _AROUND, high))
                 for i, factor in enumerate(FACTORS):
                     moves = rows_of(block.moves, part)
                     moves = replace(moves, speed_mm_s=factor * moves.speed_mm_s)
-                    worst[i] = max(worst[i], velocity_step(moves, list(block.limits), machine))
+                    step = velocity_step(moves, list(block.limits), machine, stop=stop)
+                    worst[i] = max(worst[i], step)
             steps.append(worst)
     return np.array(steps).reshape(-1, len(FACTORS)).T
 
@@ -210,7 +225,7 @@ def main() -> None:
     head = " ".join(f"{f'{100 * factor:.0f} %':>6}" for factor in FACTORS)
     print(
         f"{'file':26}{'machine':15}{'firmware':15}{'bears':>6} {head}"
-        "   above  rms um  time s  seg/s back"
+        "   above sliced  rms um  time s  seg/s back"
     )
     with tempfile.TemporaryDirectory(prefix="stillpath-breaks-") as folder:
         for name in given.files:
@@ -234,11 +249,12 @@ def main() -> None:
                     steps = steps_at_breaks(target, machine, given.breaks)
                     bears = machine.command.speed_step_mm_s
                     above = np.mean(steps[1] > 1.1 * bears)
+                    before = steps_at_breaks(sliced, machine, given.breaks, sliced=True)[1]
                     print(
                         f"{name[:25]:26}{machine_name:15}{firmware:15}"
                         f"{bears:6.0f} "
                         + " ".join(f"{step:6.0f}" for step in steps.max(axis=1, initial=0.0))
-                        + f" {100 * above:5.1f} %"
+                        + f" {100 * above:5.1f} % {before.max(initial=0.0):6.0f}"
                         f" {result.channels[1].extruding.contour_rms_um:7.3f}"
                         f" {result.compensated_s:7.1f} {result.segments_per_s:6.0f}"
                         f" {len(result.put_back):4d}",

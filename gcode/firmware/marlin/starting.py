@@ -24,14 +24,16 @@ _WITHIN_S = 1e-3
 """Time in which a motor can follow its speed step."""
 _RUNGS = (1.0, 1.1, 1.25, 1.5, 2.0, 3.0)
 """Levels tried, as multiples of the gentle acceleration; the last level is the stream's own."""
-_ROOM = 1.1
-"""Margin on the acceleration that a line needs for the speeds around it."""
+_ROOM, _RAMP_ROOM = 1.1, 1.8
+"""Margins on the acceleration that a line needs: for the turn at its begin, and along its way.
+A ramp that fills its line loses way, which the next line makes up for by a ramp of up to twice as
+much: with less, some lines are late, and their remedy raises the acceleration of more."""
 _TRIES = 8
 """Number of plans tried; in the last two, late lines get the full acceleration."""
 _BEHIND_MM, _TRAVEL_BEHIND_MM = 0.02, 0.06
 """Lag, with and without filament, from which acceleration counts as too low."""
-_BEHIND = 3
-"""Number of lines before a late one that may have caused it."""
+_CAUSES = 2
+"""Number of lines, a late one the last of them, that may have made it late."""
 
 
 def gentle_accel_mm_s2(axis_limits: CommandLimits, least_hz: float) -> float:
@@ -93,9 +95,9 @@ class StreamLevels:
         self._fast = np.any(np.abs(motors) / span_s[:, None] > steps, axis=1)
         deviation_mm = stream.junction_deviation_mm
         needed = _needed(way, motors, span_s, self._ours, gentle, deviation_mm)
-        np.maximum(needed, self._to_stop(motors / gentle, span_s), out=needed)
+        np.maximum(needed, _ROOM * self._to_stop(motors / gentle, span_s), out=needed)
         levels = np.array([*(rung[0] for rung in rungs), np.inf]) / gentle[0]
-        self._least = np.where(self._ours, np.searchsorted(levels, _ROOM * needed), 0)
+        self._least = np.where(self._ours, np.searchsorted(levels, needed), 0)
         self.level = self._spread()
 
     def raise_late(self, phases: Phases) -> NDArray[np.bool_]:
@@ -110,7 +112,7 @@ class StreamLevels:
         behind = self._behind(phases)
         around = np.zeros(len(ours), np.bool_)
         for k in np.flatnonzero((behind > 1.0) & (np.diff(behind, prepend=0.0) > 0.2)).tolist():
-            around[max(k - _BEHIND, 0) : k + self._ahead] = True
+            around[max(k + 1 - _CAUSES, 0) : k + 1] = True
         self._tries += 1
         around &= ours & (self._least < top) & (self._tries <= _TRIES)
         self._least[around] = top if self._tries > _TRIES - 2 else self._least[around] + 1
@@ -167,7 +169,7 @@ def _needed(
     gentle: NDArray[np.float64],
     deviation_mm: float,
 ) -> NDArray[np.float64]:
-    """Return the acceleration that each line needs for its speed, relative to the gentle one.
+    """Return the acceleration that each line should have, relative to the gentle one.
 
     A line speeds up within itself, and brakes within itself for the next; what turns at its begin
     is borne like the curve that short moves are part of, or by junction deviation.
@@ -186,5 +188,6 @@ def _needed(
     turn = np.diff(heading, axis=0, prepend=heading[:1]) * np.minimum(speed, before)[:, None]
     size = np.abs(turn / gentle).max(axis=1)
     corner = (turn**2 / gentle).max(axis=1) / (8.0 * deviation_mm)
-    needed: NDArray[np.float64] = np.maximum(np.maximum(along, size / span_s), corner)
+    turning = np.maximum(size / span_s, corner)
+    needed: NDArray[np.float64] = np.maximum(_RAMP_ROOM * along, _ROOM * turning)
     return needed
