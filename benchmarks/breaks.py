@@ -63,6 +63,8 @@ def velocity_step(
     Of an axis that bears more, the same share of what it bears. Marlin's by its steps. `stop`: in
     the second half alone, because the start is none of the print's.
     """
+    if not len(moves):
+        return 0.0
     if machine.firmware.kind == "marlin":
         t_s, place_mm = stepped(
             moves, limits, machine.firmware, corexy=machine.kinematics == "corexy"

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import zip_longest
 
 import numpy as np
 from numpy.typing import NDArray
@@ -114,7 +115,7 @@ def stepped(
     counts_first = facts[blocks.C_FIRST_STEPS] == 1.0
     entry2 = rows[0][blocks.Q_FLOOR2] if rows else 0.0
     times, places = [np.zeros(1)], [moves.start_mm[:1, :2]]
-    for row, nxt in zip(rows, [*rows[1:], None], strict=True):
+    for row, nxt in zip_longest(rows, rows[1:]):
         exit2 = row[blocks.Q_FLOOR2]
         if nxt is not None:
             gain2 = 2.0 * row[blocks.Q_ACCEL] * row[blocks.Q_PATH]
