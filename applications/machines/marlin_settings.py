@@ -48,6 +48,12 @@ _WORD = re.compile(r"([A-Z])(-?\d+(?:\.\d*)?)?")
 _MARLIN_2_0 = re.compile(r"Advanced: B<|FIRMWARE_NAME:Marlin 2\.0\b")
 """Heading of M205 in 2.0.5 to 2.0.9.1 and forks of them (settings.cpp; since 2.0.9.2 `Advanced
 (B<`), or what M115 says."""
+_MARLIN_1 = re.compile(r"Advanced(?: variables: S=|: [QS]<)")
+"""Heading of M205 in Marlin 1, which runs on 8-bit boards: 1.0 and Prusa's for the MK3 (3.13,
+ConfigurationStore.cpp), 1.1.0 to 1.1.8 and 1.1.9 (configuration_store.cpp)."""
+_BUDDY = re.compile(r"(?m)^[^;\n]*Unified Bed Leveling:")
+"""A heading of M503 in Prusa's Buddy firmware, and with that option in Marlin before 2.0.5; later
+ones have a semicolon before it."""
 _ROUNDED = (
     "planner.junction_deviation_mm",
     "linear_advance_k_s",
@@ -166,15 +172,25 @@ def _check_printer(found: dict[str, _Words], name: str) -> None:
 def _versions(found: dict[str, _Words], text: str) -> dict[str, Any]:
     """Return what an answer tells of the firmware's version."""
     section: dict[str, Any] = {}
-    if "M970" in found or "Prusa-Firmware-Buddy" in text:
-        # Phase stepping, which only that firmware has (configuration_store.cpp, 2025-04), or M115.
+    if _is_buddy(found, text):
         section["variant"] = "prusa"
     elif _MARLIN_2_0.search(text):
         section["variant"] = "2.0"
+    if _MARLIN_1.search(text):
+        section["board"] = "avr"
     if "M493" in found:
         # Version 1 reports Y's frequency as B, version 2 one line for each axis.
         section["ft_motion_version"] = 1 if "B" in found["M493"] else 2
     return section
+
+
+def _is_buddy(found: dict[str, _Words], text: str) -> bool:
+    """Return whether Prusa's Buddy firmware answered (configuration_store.cpp, 4.4 to 6.3)."""
+    if "Prusa-Firmware-Buddy" in text or "M970" in found:
+        return True  # M115; or phase stepping, which no other has, but not every Buddy either
+    if "FIRMWARE_NAME:" in text or "M145" in found:
+        return False  # the rest is also said by Marlin before 2.0.5, with M145 if it has a display
+    return "B" in found.get("M205", {}) and "J" not in found["M205"] and bool(_BUDDY.search(text))
 
 
 def machine_from_m503(
@@ -334,11 +350,16 @@ def _set_fields(section: dict[str, Any], fields: Sequence[str]) -> None:
 
 
 def _lines(text: str) -> Iterator[tuple[str, _Words]]:
-    """Yield the commands of a reply in order, each with its words."""
+    """Yield the commands of a reply in order, each with its words.
+
+    Prusa's MK3 prints the limits of its stealth mode, too, behind those of the normal one.
+    """
+    before = ""
     for line in text.splitlines():
+        heading, before = before, line
         if len(line) > _LONGEST_LINE or (match := _COMMAND.search(line)) is None:
             continue
-        if ";" not in line[: match.start()]:
+        if ";" not in line[: match.start()] and "- stealth (" not in heading:
             found = _WORD.findall(match[2])
             yield match[1], {letter: float(value) if value else None for letter, value in found}
 
