@@ -174,6 +174,7 @@ def _versions(found: dict[str, _Words], text: str) -> dict[str, Any]:
     section: dict[str, Any] = {}
     if _is_buddy(found, text):
         section["variant"] = "prusa"
+        section["block_buffer_size"] = 32  # of all printers, since 5.0
     elif _MARLIN_2_0.search(text):
         section["variant"] = "2.0"
     if _MARLIN_1.search(text):

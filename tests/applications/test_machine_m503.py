@@ -124,7 +124,8 @@ echo:  M205 S0.00 T0.00 B20000 X8.00 Y8.00 Z0.40 E4.50
 def test_a_buddy_without_phase_stepping_is_none_of_marlins_releases(make, capsys) -> None:
     """Its answer has the headings of Marlin before 2.0.5, and was taken for 2.0's."""
     code, out, _ = make(MK4)
-    assert (code, stored(capsys).firmware.variant) == (0, "prusa")
+    firmware = stored(capsys).firmware
+    assert (code, firmware.variant, firmware.block_buffer_size) == (0, "prusa", 32)
     assert "HWLIMIT_NORMAL_MAX_ACCELERATION" in out
 
 
