@@ -133,7 +133,8 @@ def firmware_section(text: str, name: str) -> dict[str, Any]:
         # Each is printed by every build that has it.
         "linear_advance": "M900" in found,
         "linear_advance_k_s": word("M900", "K", 0.0),
-        "shaper": _shaper(found),
+        # A Buddy has one, of which its answer says nothing (M593 without words does).
+        "shaper": None if _is_buddy(found, text) else _shaper(found),
         "ft_motion": word("M493", "S", 0.0) > 0.0,
         "retraction": _retraction(found, word),
     }
@@ -222,8 +223,8 @@ def machine_from_m503(
         If something is missing or invalid.
     """
     section = {**ASSUMED, **firmware_section(text, file)}
-    shaper = section["shaper"]
-    tuned = (shaper["freq_x_hz"], shaper["freq_y_hz"])
+    shaper = section["shaper"] or {}
+    tuned = (shaper.get("freq_x_hz", 0.0), shaper.get("freq_y_hz", 0.0))
     _set_fields(section, fields)
     document = {
         "name": stated.name,
@@ -266,7 +267,7 @@ def with_m503(machine: Machine, text: str, file: str) -> Machine:
         before = machine.firmware.model_dump(mode="json", exclude_unset=True)
         _unrounded(said, before)
     for part in ("planner", "shaper"):
-        said[part] = {**(before.get(part) or {}), **said[part]}
+        said[part] = {**(before.get(part) or {}), **(said[part] or {})} or None
     try:
         return with_firmware(machine, {**before, **said})
     except ValidationError as error:

@@ -126,6 +126,7 @@ def test_a_buddy_without_phase_stepping_is_none_of_marlins_releases(make, capsys
     code, out, _ = make(MK4)
     firmware = stored(capsys).firmware
     assert (code, firmware.variant, firmware.block_buffer_size) == (0, "prusa", 32)
+    assert firmware.shaper is None  # it has one, and does not say which
     assert "HWLIMIT_NORMAL_MAX_ACCELERATION" in out
 
 
