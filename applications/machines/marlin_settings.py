@@ -137,6 +137,7 @@ def firmware_section(text: str, name: str) -> dict[str, Any]:
         "shaper": None if _is_buddy(found, text) else _shaper(found),
         "ft_motion": word("M493", "S", 0.0) > 0.0,
         "retraction": _retraction(found, word),
+        **_arcs(found),
     }
 
 
@@ -389,6 +390,13 @@ def _shaper(found: dict[str, _Words]) -> dict[str, float]:
         if (damping := words.get("D")) is not None:
             shaper[f"damping_{axis}"] = damping
     return shaper
+
+
+def _arcs(found: dict[str, _Words]) -> dict[str, float]:
+    """Return how finely Prusa's MK3 cuts arcs (M214 of 3.11 and later, motion_control.cpp)."""
+    words = found.get("M214", {})
+    fields = {"arc_resolution_mm": "P", "min_arc_segment_mm": "S", "min_circle_segments": "R"}
+    return {field: value for field, letter in fields.items() if (value := words.get(letter))}
 
 
 def _retraction(found: dict[str, _Words], word: Any) -> dict[str, float] | None:

@@ -118,6 +118,8 @@ echo:Acceleration: P=print, R=retract, T=travel
 echo:  M204 P1250.00 R1250.00 T1250.00
 echo:Advanced variables: S=Min feedrate (mm/s), T=Min travel feedrate (mm/s)
 echo:  M205 S0.00 T0.00 B20000 X8.00 Y8.00 Z0.40 E4.50
+echo:Arc Settings: P:Max length(mm) S:Min length (mm) N:Corrections R:Min segments F:Segments/sec.
+echo:  M214 P1.00 S0.50 N25 R20 F0
 """
 
 
@@ -167,6 +169,15 @@ def test_an_mk3_has_the_limits_of_its_normal_mode(make, capsys) -> None:
     make(MK3)
     planner = stored(capsys).firmware.planner
     assert (planner.max_feedrate_mm_s.x, planner.max_accel_mm_s2.y) == (200.0, 1250.0)
+
+
+def test_an_mk3_says_how_it_cuts_arcs(make, capsys) -> None:
+    """With the 72 pieces a circle that Marlin makes, a circle of 2 mm took a third less."""
+    make(MK3)
+    firmware = stored(capsys).firmware
+    assert (firmware.arc_resolution_mm, firmware.min_arc_segment_mm) == (1.0, 0.5)
+    assert firmware.min_circle_segments == 20
+    assert make(MK3.replace("P1.00 S0.50 N25 R20", "P1.00 S0.00 N25 R0"), "--name", "other")[0] == 0
 
 
 def test_axes_that_begin_beside_the_bed(make, capsys) -> None:
