@@ -84,20 +84,20 @@ _SIGNS = (
     _sign(
         "prusa",
         4,
-        rb"^; ?printer_model = (?:MINI(?:IS)?|MK4(?:S|IS)?|MK3\.[59]S?|XL\d?(?:IS)?|COREONEL?"
+        rb"^; ?printer_model = (?:MINI(?:IS)?|MK4(?:S|IS)?|MK3\.[59]S?|XL\d?(?:IS)?|COREONE\w*"
         rb"|HT90|iX)(?:MMU\d)?[ \t\r]*$",
         "printer_model is one with Prusa's Buddy firmware",
     ),
     _sign(
         "prusa",
         3,
-        _LINE + rb"M862\.3 P ?\"(?:MINI|MK4S?|MK3\.[59]S?|XL|COREONE|iX)\"",
+        _LINE + rb"M862\.3 P ?\"(?:MINI|MK4S?|MK3\.[59]S?|XL|COREONE\w*|iX)\"",
         "M862.3 asks for a printer with Prusa's Buddy firmware",
     ),
     _sign(
         "marlin",
         3,
-        rb"^; ?printer_model = (?:MK3S?|MK2\.?5?S?)\b(?!\.)",
+        rb"^; ?printer_model = (?:MK3S?|MK2\.?5?S?)(?:MMU?\dS?|MM)?\b(?!\.)",
         "printer_model is one with Prusa's 8-bit Marlin",
     ),
     _sign("bambu", 4, rb"^; ?printer_model = Bambu Lab", "printer_model is Bambu Lab's"),
