@@ -101,6 +101,7 @@ def firmware_section(text: str, name: str) -> dict[str, Any]:
     """
     _check_text(text, name)
     found = _commands(text)
+    _rename_of_1_0(found)
     _check_printer(found, name)
 
     def word(command: str, letter: str, default: float | None = None) -> float:
@@ -139,6 +140,18 @@ def firmware_section(text: str, name: str) -> dict[str, Any]:
         "retraction": _retraction(found, word),
         **_arcs(found),
     }
+
+
+def _rename_of_1_0(found: dict[str, _Words]) -> None:
+    """Give what Marlin 1.0 prints today's names: M204 S and T (of retractions), M205 X of X and Y.
+
+    So do Prusa's for the MK2 and MK3 of old (ConfigurationStore.cpp).
+    """
+    old, jerk = found.get("M204", {}), found.get("M205", {})
+    if "S" in old and "P" not in old:
+        found["M204"] = {"P": old["S"], "R": old.get("T", old["S"]), "T": old["S"]}
+    if "X" in jerk:
+        jerk.setdefault("Y", jerk["X"])
 
 
 def _check_text(text: str, name: str) -> None:

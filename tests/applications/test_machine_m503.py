@@ -165,6 +165,15 @@ def test_marlin_1_runs_on_an_8_bit_board(make, capsys, text: str) -> None:
     assert make(text, "--name", "other", "--set", "board=32bit")[1].count("compensated") == 0
 
 
+def test_marlin_1_0_has_other_words(make, capsys) -> None:
+    """Such an answer was said to be incomplete, and to be sent again."""
+    text = MK3.replace("P1250.00 R1250.00 T1250.00", "S1250.00 T1500.00").replace(" Y8.00", "")
+    assert make(text)[0] == 0
+    planner = stored(capsys).firmware.planner
+    assert (planner.accel_mm_s2, planner.travel_accel_mm_s2) == (1250.0, 1250.0)
+    assert (planner.retract_accel_mm_s2, planner.jerk_mm_s.y) == (1500.0, 8.0)
+
+
 def test_an_mk3_has_the_limits_of_its_normal_mode(make, capsys) -> None:
     make(MK3)
     planner = stored(capsys).firmware.planner
