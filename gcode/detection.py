@@ -13,9 +13,11 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-__all__ = ["DIALECTS", "Detection", "detect"]
+__all__ = ["DIALECTS", "EIGHT_BIT_PRUSA", "Detection", "detect"]
 
 DIALECTS = ("klipper", "marlin", "reprapfirmware", "prusa", "bambu")
+EIGHT_BIT_PRUSA = "printer_model is one with Prusa's 8-bit Marlin"
+"""Reason of a file for the MK3 and its forerunners."""
 _HEAD_BYTES = 1 << 18
 _TAIL_BYTES = 1 << 18
 _SURE = 4.0
@@ -98,7 +100,7 @@ _SIGNS = (
         "marlin",
         3,
         rb"^; ?printer_model = (?:MK3S?|MK2\.?5?S?)(?:MMU?\dS?|MM)?\b(?!\.)",
-        "printer_model is one with Prusa's 8-bit Marlin",
+        EIGHT_BIT_PRUSA,
     ),
     _sign("bambu", 4, rb"^; ?printer_model = Bambu Lab", "printer_model is Bambu Lab's"),
     # Commands.
