@@ -24,7 +24,6 @@ FIRMWARE = Marlin(
     variant="prusa",
     steps_per_mm=PerAxis(x=100.0, y=100.0, z=400.0, e=380.0),
     junction="classic_jerk",
-    block_buffer_size=32,
 )
 
 
@@ -57,7 +56,7 @@ def test_positions_are_quarters_of_steps() -> None:
 
 
 def test_half_of_the_queue_is_known() -> None:
-    """The other half is steps already; a queue of 32 was taken to show 29 blocks ahead."""
+    """The other half is steps already; 29 blocks were taken to be known, or 13."""
     found = lasts_ms(np.arange(61.0)[:, None], 300.0)
     begin = [39.96, 16.5685, 12.7135, 10.718, 9.4427, 8.5369, 7.8505, 7.307, 6.8629, 6.4911]
     begin += [6.1739, 5.8991, 5.658, 5.4442, 5.253]

@@ -30,6 +30,9 @@ _FAMILY = {
 }
 _PRUSA_PARTS = 4
 """PLANNER_STEPS_MULTIPLIER: positions are rounded to a quarter of a step."""
+_PRUSA_AHEAD = 15
+"""Half of BLOCK_BUFFER_SIZE, 32 of all printers since 5.0, whatever the document assumes: the other
+half is steps already (PreciseStepping::is_waiting_before_delivering)."""
 _RELEASE_MIN_RATE_HZ = 120.0
 """MINIMAL_STEP_RATE of 2.0 and 2.1; bugfix has what the timer can hold."""
 
@@ -133,10 +136,9 @@ def planner_facts(firmware: Marlin, *, corexy: bool) -> NDArray[np.float64]:
     facts[blocks.C_AHEAD] = firmware.block_buffer_size - 3
     facts[blocks.C_SLOWDOWN] = 0.5 * firmware.block_buffer_size - 1.0 if firmware.slowdown else 0.0
     if firmware.variant == "prusa":
-        # Half of the queue is steps already (PreciseStepping::is_waiting_before_delivering), it
-        # slows down only where the file comes too slowly, and M203 X holds for the motors A and B
-        # (COREXY_CONVERT_LIMITS; both Planner::_populate_block). Of Bambu's that is not known.
-        facts[blocks.C_AHEAD] = firmware.block_buffer_size // 2 - 1
+        # It slows down only where the file comes too slowly, and M203 X holds for the motors A and
+        # B (COREXY_CONVERT_LIMITS; both Planner::_populate_block). Of Bambu's that is not known.
+        facts[blocks.C_AHEAD] = _PRUSA_AHEAD
         facts[blocks.C_SLOWDOWN] = 0.0
         facts[blocks.C_MOTOR_SPEED] = corexy
     facts[blocks.C_MIN_SPEED] = firmware.minimum_planner_speed_mm_s
