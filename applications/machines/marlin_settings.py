@@ -204,7 +204,7 @@ def _is_buddy(found: dict[str, _Words], text: str) -> bool:
     """Return whether Prusa's Buddy firmware answered (configuration_store.cpp, 4.4 to 6.3)."""
     if "Prusa-Firmware-Buddy" in text or "M970" in found:
         return True  # M115; or phase stepping, which no other has, but not every Buddy either
-    if "FIRMWARE_NAME:" in text or "M145" in found:
+    if "FIRMWARE_NAME:" in text or "M145" in found or _MARLIN_1.search(text):
         return False  # the rest is also said by Marlin before 2.0.5, with M145 if it has a display
     return "B" in found.get("M205", {}) and "J" not in found["M205"] and bool(_BUDDY.search(text))
 

@@ -153,13 +153,14 @@ def test_marlin_before_2_0_5_is_no_buddy(make, capsys, text: str) -> None:
         MK3,
         # 1.1.9 and 1.1.8, as on Creality's and Artillery's printers of 2018 to 2020.
         MK4.replace("Advanced: B<", "Advanced: Q<").replace("M205 B20000.00", "M205 Q20000"),
-        MK4.replace("Advanced: B<", "Advanced: S<").replace("M205 B20000.00 S0.00", "M205 S0.00"),
+        MK4.replace("Advanced: B<", "Advanced: S<").replace("B20000.00 S0.00", "S0.00 B20000"),
     ],
 )
 def test_marlin_1_runs_on_an_8_bit_board(make, capsys, text: str) -> None:
     """A stream for a 32-bit board was written for it."""
     code, out, _ = make(text)
-    assert (code, stored(capsys).firmware.board) == (0, "avr")
+    firmware = stored(capsys).firmware
+    assert (code, firmware.board, firmware.variant) == (0, "avr", "2.1")
     assert "board=32bit" not in out
     assert "can be simulated, not compensated: an 8-bit board" in out
     assert make(text, "--name", "other", "--set", "board=32bit")[1].count("compensated") == 0
