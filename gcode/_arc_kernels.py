@@ -69,7 +69,7 @@ def arc_pieces(f: Any, rule: int, radius: float, angle: float, rise: float, whol
         if rule == _MARLIN_2_0:
             least = max(1.0, ceil(f[F_ARC_PER_CIRCLE] * fabs(angle) / (2.0 * pi)))
         return float(max(least, floor(length / f[F_ARC_MM])))
-    if rule == _MARLIN_2_1:
+    if rule == _MARLIN_2_1 and f[F_ARC_DEVIATION_MM] == 0.0:
         least = f[F_ARC_PER_CIRCLE]
         if not whole:
             least = ceil(f[F_ARC_PER_CIRCLE] * fabs(angle) / (2.0 * pi))
@@ -83,6 +83,7 @@ def arc_pieces(f: Any, rule: int, radius: float, angle: float, rise: float, whol
         if flat / pieces < f[F_ARC_LEAST_MM]:
             return float(max(1.0, floor(flat / f[F_ARC_LEAST_MM])))
         return float(pieces)
+    # RepRapFirmware, and Prusa's Buddy after it.
     each = min(sqrt(8.0 * radius * f[F_ARC_DEVIATION_MM]), f[F_SPEED] / f[F_ARC_PER_S])
     each = min(max(each, f[F_ARC_LEAST_MM]), f[F_ARC_MM])
     return float(max(1.0, floor(flat / each + 0.8)))

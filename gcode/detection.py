@@ -13,9 +13,11 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-__all__ = ["DIALECTS", "Detection", "detect"]
+__all__ = ["DIALECTS", "EIGHT_BIT_PRUSA", "Detection", "detect"]
 
 DIALECTS = ("klipper", "marlin", "reprapfirmware", "prusa", "bambu")
+EIGHT_BIT_PRUSA = "printer_model is one with Prusa's 8-bit Marlin"
+"""Reason of a file for the MK3 and its forerunners."""
 _HEAD_BYTES = 1 << 18
 _TAIL_BYTES = 1 << 18
 _SURE = 4.0
@@ -84,21 +86,21 @@ _SIGNS = (
     _sign(
         "prusa",
         4,
-        rb"^; ?printer_model = (?:MINI(?:IS)?|MK4(?:S|IS)?|MK3\.[59]S?|XL\d?(?:IS)?|COREONEL?"
+        rb"^; ?printer_model = (?:MINI(?:IS)?|MK4(?:S|IS)?|MK3\.[59]S?|XL\d?(?:IS)?|COREONE\w*"
         rb"|HT90|iX)(?:MMU\d)?[ \t\r]*$",
         "printer_model is one with Prusa's Buddy firmware",
     ),
     _sign(
         "prusa",
         3,
-        _LINE + rb"M862\.3 P ?\"(?:MINI|MK4S?|MK3\.[59]S?|XL|COREONE|iX)\"",
+        _LINE + rb"M862\.3 P ?\"(?:MINI|MK4S?|MK3\.[59]S?|XL|COREONE\w*|iX)\"",
         "M862.3 asks for a printer with Prusa's Buddy firmware",
     ),
     _sign(
         "marlin",
         3,
-        rb"^; ?printer_model = (?:MK3S?|MK2\.?5?S?)\b(?!\.)",
-        "printer_model is one with Prusa's 8-bit Marlin",
+        rb"^; ?printer_model = (?:MK3S?|MK2\.?5?S?)(?:MMU?\dS?|MM)?\b(?!\.)",
+        EIGHT_BIT_PRUSA,
     ),
     _sign("bambu", 4, rb"^; ?printer_model = Bambu Lab", "printer_model is Bambu Lab's"),
     # Commands.

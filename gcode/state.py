@@ -427,6 +427,9 @@ def _set_arcs(f: NDArray[np.float64], firmware: FirmwareFacts) -> None:
     if isinstance(firmware, Marlin):
         f[at.F_ARC_LEAST_MM] = firmware.min_arc_segment_mm
         f[at.F_ARC_PER_CIRCLE] = firmware.min_circle_segments
+        if firmware.variant == "prusa":
+            # MAX_ARC_SEGMENT_MM, MIN_ARC_SEGMENTS_PER_SEC, MAX_ARC_DEVIATION of all its printers.
+            f[at.F_ARC_MM], f[at.F_ARC_PER_S], f[at.F_ARC_DEVIATION_MM] = 2.0, 50.0, 0.02
     elif isinstance(firmware, RepRapFirmware):
         f[at.F_ARC_LEAST_MM] = firmware.arc_least_mm
         f[at.F_ARC_PER_S] = firmware.arc_segments_per_s

@@ -6,7 +6,7 @@ import io
 import re
 from typing import BinaryIO
 
-from stillpath.gcode.detection import detect
+from stillpath.gcode.detection import EIGHT_BIT_PRUSA, detect
 from stillpath.gcode.dialect import Dialect
 from stillpath.gcode.firmware.dialects import dialect_of
 from stillpath.gcode.firmware.reprapfirmware.dialect import awaiting_extruder_mode
@@ -25,6 +25,11 @@ _BEGINNING_BYTES = 1 << 23
 _MODE = re.compile(rb"^(?:[^;\s][^;\n]*)?\bM8[23](?!\d)", re.MULTILINE | re.IGNORECASE)
 """Not indented, for that may be under a condition."""
 _FEEDS = re.compile(rb"^[ \t]*(?:N\d+[ \t]*)?G0*[0-3](?!\d)[^;\n]*E", re.MULTILINE | re.IGNORECASE)
+_EIGHT_BIT = (
+    "the file was sliced for an MK3 or its forerunners (printer_model), whose own board has 8 bits "
+    "and cannot execute a compensated file, and {} has a board of 32: unless you replaced the "
+    "board, set board to avr in the machine, and print the file as sliced"
+)
 _OFFSHOOTS = ("prusa", "bambu")
 """Dialects that may be requested for a Marlin machine."""
 _EXPECTED = ("klipper", "marlin")
@@ -118,6 +123,10 @@ def doubts(file: BinaryIO, machine: Machine, name: DialectName | None = None) ->
     file.seek(max(size - _END_BYTES, 0))
     found = detect(head, file.read(_END_BYTES))
     file.seek(place)
+    firmware = machine.firmware
+    if own.name == "marlin" and EIGHT_BIT_PRUSA in found.reasons:
+        has_8_bits = isinstance(firmware, Marlin) and firmware.board == "avr"
+        return [] if has_8_bits else [_EIGHT_BIT.format(machine.name)]
     if found.doubtful or found.dialect == own.name or (own.name, found.dialect) == _EXPECTED:
         return []
     why = "; ".join(found.reasons)
@@ -126,6 +135,11 @@ def doubts(file: BinaryIO, machine: Machine, name: DialectName | None = None) ->
         f"reads it as {own.title} does: slice for {own.title}, or say that "
         f"it is written for {own.title} (dialect {own.name})"
     )
+    if isinstance(firmware, Marlin) and found.dialect in _OFFSHOOTS:
+        text += (
+            f"; if the printer runs {found.dialect.title()}'s own firmware, which cannot execute a "
+            f"file compensated for {own.title}, set variant to {found.dialect} in its machine"
+        )
     return [text]
 
 

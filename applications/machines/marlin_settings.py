@@ -48,6 +48,12 @@ _WORD = re.compile(r"([A-Z])(-?\d+(?:\.\d*)?)?")
 _MARLIN_2_0 = re.compile(r"Advanced: B<|FIRMWARE_NAME:Marlin 2\.0\b")
 """Heading of M205 in 2.0.5 to 2.0.9.1 and forks of them (settings.cpp; since 2.0.9.2 `Advanced
 (B<`), or what M115 says."""
+_MARLIN_1 = re.compile(r"Advanced(?: variables: S=|: [QS]<)")
+"""Heading of M205 in Marlin 1, which runs on 8-bit boards: 1.0 and Prusa's for the MK3 (3.13,
+ConfigurationStore.cpp), 1.1.0 to 1.1.8 and 1.1.9 (configuration_store.cpp)."""
+_BUDDY = re.compile(r"(?m)^[^;\n]*Unified Bed Leveling:")
+"""A heading of M503 in Prusa's Buddy firmware, and with that option in Marlin before 2.0.5; later
+ones have a semicolon before it."""
 _ROUNDED = (
     "planner.junction_deviation_mm",
     "linear_advance_k_s",
@@ -95,6 +101,7 @@ def firmware_section(text: str, name: str) -> dict[str, Any]:
     """
     _check_text(text, name)
     found = _commands(text)
+    _rename_of_1_0(found)
     _check_printer(found, name)
 
     def word(command: str, letter: str, default: float | None = None) -> float:
@@ -127,10 +134,24 @@ def firmware_section(text: str, name: str) -> dict[str, Any]:
         # Each is printed by every build that has it.
         "linear_advance": "M900" in found,
         "linear_advance_k_s": word("M900", "K", 0.0),
-        "shaper": _shaper(found),
+        # A Buddy has one, of which its answer says nothing (M593 without words does).
+        "shaper": None if _is_buddy(found, text) else _shaper(found),
         "ft_motion": word("M493", "S", 0.0) > 0.0,
         "retraction": _retraction(found, word),
+        **_arcs(found),
     }
+
+
+def _rename_of_1_0(found: dict[str, _Words]) -> None:
+    """Give what Marlin 1.0 prints today's names: M204 S and T (of retractions), M205 X of X and Y.
+
+    So do Prusa's for the MK2 and MK3 of old (ConfigurationStore.cpp).
+    """
+    old, jerk = found.get("M204", {}), found.get("M205", {})
+    if "S" in old and "P" not in old:
+        found["M204"] = {"P": old["S"], "R": old.get("T", old["S"]), "T": old["S"]}
+    if "X" in jerk:
+        jerk.setdefault("Y", jerk["X"])
 
 
 def _check_text(text: str, name: str) -> None:
@@ -166,15 +187,26 @@ def _check_printer(found: dict[str, _Words], name: str) -> None:
 def _versions(found: dict[str, _Words], text: str) -> dict[str, Any]:
     """Return what an answer tells of the firmware's version."""
     section: dict[str, Any] = {}
-    if "M970" in found or "Prusa-Firmware-Buddy" in text:
-        # Phase stepping, which only that firmware has (configuration_store.cpp, 2025-04), or M115.
+    if _is_buddy(found, text):
         section["variant"] = "prusa"
+        section["block_buffer_size"] = 32  # of all printers, since 5.0
     elif _MARLIN_2_0.search(text):
         section["variant"] = "2.0"
+    if _MARLIN_1.search(text):
+        section["board"] = "avr"
     if "M493" in found:
         # Version 1 reports Y's frequency as B, version 2 one line for each axis.
         section["ft_motion_version"] = 1 if "B" in found["M493"] else 2
     return section
+
+
+def _is_buddy(found: dict[str, _Words], text: str) -> bool:
+    """Return whether Prusa's Buddy firmware answered (configuration_store.cpp, 4.4 to 6.3)."""
+    if "Prusa-Firmware-Buddy" in text or "M970" in found:
+        return True  # M115; or phase stepping, which no other has, but not every Buddy either
+    if "FIRMWARE_NAME:" in text or "M145" in found or _MARLIN_1.search(text):
+        return False  # the rest is also said by Marlin before 2.0.5, with M145 if it has a display
+    return "B" in found.get("M205", {}) and "J" not in found["M205"] and bool(_BUDDY.search(text))
 
 
 def machine_from_m503(
@@ -205,8 +237,8 @@ def machine_from_m503(
         If something is missing or invalid.
     """
     section = {**ASSUMED, **firmware_section(text, file)}
-    shaper = section["shaper"]
-    tuned = (shaper["freq_x_hz"], shaper["freq_y_hz"])
+    shaper = section["shaper"] or {}
+    tuned = (shaper.get("freq_x_hz", 0.0), shaper.get("freq_y_hz", 0.0))
     _set_fields(section, fields)
     document = {
         "name": stated.name,
@@ -249,7 +281,7 @@ def with_m503(machine: Machine, text: str, file: str) -> Machine:
         before = machine.firmware.model_dump(mode="json", exclude_unset=True)
         _unrounded(said, before)
     for part in ("planner", "shaper"):
-        said[part] = {**(before.get(part) or {}), **said[part]}
+        said[part] = {**(before.get(part) or {}), **(said[part] or {})} or None
     try:
         return with_firmware(machine, {**before, **said})
     except ValidationError as error:
@@ -334,11 +366,16 @@ def _set_fields(section: dict[str, Any], fields: Sequence[str]) -> None:
 
 
 def _lines(text: str) -> Iterator[tuple[str, _Words]]:
-    """Yield the commands of a reply in order, each with its words."""
+    """Yield the commands of a reply in order, each with its words.
+
+    Prusa's MK3 prints the limits of its stealth mode, too, behind those of the normal one.
+    """
+    before = ""
     for line in text.splitlines():
+        heading, before = before, line
         if len(line) > _LONGEST_LINE or (match := _COMMAND.search(line)) is None:
             continue
-        if ";" not in line[: match.start()]:
+        if ";" not in line[: match.start()] and "- stealth (" not in heading:
             found = _WORD.findall(match[2])
             yield match[1], {letter: float(value) if value else None for letter, value in found}
 
@@ -366,6 +403,13 @@ def _shaper(found: dict[str, _Words]) -> dict[str, float]:
         if (damping := words.get("D")) is not None:
             shaper[f"damping_{axis}"] = damping
     return shaper
+
+
+def _arcs(found: dict[str, _Words]) -> dict[str, float]:
+    """Return how finely Prusa's MK3 cuts arcs (M214 of 3.11 and later, motion_control.cpp)."""
+    words = found.get("M214", {})
+    fields = {"arc_resolution_mm": "P", "min_arc_segment_mm": "S", "min_circle_segments": "R"}
+    return {field: value for field, letter in fields.items() if (value := words.get(letter))}
 
 
 def _retraction(found: dict[str, _Words], word: Any) -> dict[str, float] | None:

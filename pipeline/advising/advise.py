@@ -214,7 +214,10 @@ class _Job:
         return [
             *stored_settings(reading.stored_lines, shaper=given_back),
             *shaper_warnings(
-                self._unmodelled, none_known=not self._adviser.shapers, left=shaper_left
+                self._unmodelled,
+                none_known=not self._adviser.shapers,
+                stated=self._adviser.stated is not None,
+                left=shaper_left,
             ),
             *beyond_bounds(
                 figures.features,

@@ -9,7 +9,9 @@ from stillpath.pipeline.result import AdvisedFeature
 __all__ = ["beyond_bounds", "kept_beyond", "shaper_warnings", "stored_settings", "withdrawn"]
 
 
-def shaper_warnings(unmodelled: Sequence[str], *, none_known: bool, left: bool) -> list[str]:
+def shaper_warnings(
+    unmodelled: Sequence[str], *, none_known: bool, stated: bool, left: bool
+) -> list[str]:
     """Return warnings about unknown settings of the printer's shaper.
 
     Parameters
@@ -18,6 +20,8 @@ def shaper_warnings(unmodelled: Sequence[str], *, none_known: bool, left: bool) 
         Shaper types in the machine document that have no model.
     none_known : bool
         The firmware does not take a shaper from a file.
+    stated : bool
+        The machine document says which shaper the printer has, or that it has none.
     left : bool
         Our shaper stays in force after the file.
     """
@@ -31,6 +35,11 @@ def shaper_warnings(unmodelled: Sequence[str], *, none_known: bool, left: bool) 
             "No shaper is advised: this firmware takes none from a file, or the machine does "
             "not say that it has one (firmware.shaper)."
         )
+        if not stated:
+            found.append(
+                "The printer's own shaper is not known (firmware.shaper in the machine): if it is "
+                "on, the printer rings less than these figures, and may print faster than advised."
+            )
     if left:
         found.append(
             "The printer's own shaper is not known (firmware.shaper in the machine): the one "

@@ -77,6 +77,119 @@ def test_a_buddy_is_none_of_marlins_releases(make, capsys, line: str) -> None:
     assert "use method advise" in out
 
 
+MK4 = """\
+echo:  G21    ; Units in mm (mm)
+
+echo:Filament settings: Disabled
+echo:  M200 D1.75
+echo:  M200 D0
+echo:Steps per unit:
+echo: M92 X100.00 Y100.00 Z400.00 E380.00
+echo:Maximum feedrates (units/s):
+echo:  M203 X300.00 Y300.00 Z40.00 E100.00
+echo:Maximum Acceleration (units/s2):
+echo:  M201 X4000.00 Y4000.00 Z200.00 E2500.00
+echo:Acceleration (units/s2): P<print_accel> R<retract_accel> T<travel_accel>
+echo:  M204 P1250.00 R800.00 T1250.00
+echo:Advanced: B<min_segment_time_us> S<min_feedrate> T<min_travel_feedrate> X<max_x_jerk>
+echo:  M205 B20000.00 S0.00 T0.00 X8.00 Y8.00 Z2.00 E5.00
+echo:Unified Bed Leveling:
+echo:  M420 S0 Z0.00
+echo:Filament load/unload lengths:
+echo:  M603 L80.00 U80.00
+ok
+"""
+"""Of Buddy 5.2, and of printers without phase stepping (MINI, MK3.5) until today."""
+
+MK3 = """\
+echo:Steps per unit:
+echo:  M92 X100.00 Y100.00 Z400.00 E280.00
+echo:UStep resolution:
+echo: M350 X16 Y16 Z16 E32
+echo:Maximum feedrates - normal (mm/s):
+echo:  M203 X200.00 Y200.00 Z12.00 E120.00
+echo:Maximum feedrates - stealth (mm/s):
+echo:  M203 X100.00 Y100.00 Z12.00 E120.00
+echo:Maximum acceleration - normal (mm/s2):
+echo:  M201 X1250 Y1250 Z500 E5000
+echo:Maximum acceleration - stealth (mm/s2):
+echo:  M201 X960 Y960 Z500 E5000
+echo:Acceleration: P=print, R=retract, T=travel
+echo:  M204 P1250.00 R1250.00 T1250.00
+echo:Advanced variables: S=Min feedrate (mm/s), T=Min travel feedrate (mm/s)
+echo:  M205 S0.00 T0.00 B20000 X8.00 Y8.00 Z0.40 E4.50
+echo:Arc Settings: P:Max length(mm) S:Min length (mm) N:Corrections R:Min segments F:Segments/sec.
+echo:  M214 P1.00 S0.50 N25 R20 F0
+"""
+
+
+def test_a_buddy_without_phase_stepping_is_none_of_marlins_releases(make, capsys) -> None:
+    """Its answer has the headings of Marlin before 2.0.5, and was taken for 2.0's."""
+    code, out, _ = make(MK4)
+    firmware = stored(capsys).firmware
+    assert (code, firmware.variant, firmware.block_buffer_size) == (0, "prusa", 32)
+    assert firmware.shaper is None  # it has one, and does not say which
+    assert "HWLIMIT_NORMAL_MAX_ACCELERATION" in out
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "FIRMWARE_NAME:Marlin 2.0.3 (GitHub)\n" + MK4,
+        MK4.replace("ok\n", "echo:  M145 S0 H180 B70 F0\n"),
+        MK4.replace("X8.00", "J0.02 X8.00"),
+        MK4.replace("Unified", "; Unified"),
+        MK4.replace("Unified", "Mesh"),
+    ],
+)
+def test_marlin_before_2_0_5_is_no_buddy(make, capsys, text: str) -> None:
+    assert make(text)[0] == 0
+    assert stored(capsys).firmware.variant == "2.0"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        MK3,
+        # 1.1.9 and 1.1.8, as on Creality's and Artillery's printers of 2018 to 2020.
+        MK4.replace("Advanced: B<", "Advanced: Q<").replace("M205 B20000.00", "M205 Q20000"),
+        MK4.replace("Advanced: B<", "Advanced: S<").replace("B20000.00 S0.00", "S0.00 B20000"),
+    ],
+)
+def test_marlin_1_runs_on_an_8_bit_board(make, capsys, text: str) -> None:
+    """A stream for a 32-bit board was written for it."""
+    code, out, _ = make(text)
+    firmware = stored(capsys).firmware
+    assert (code, firmware.board, firmware.variant) == (0, "avr", "2.1")
+    assert "board=32bit" not in out
+    assert "can be simulated, not compensated: an 8-bit board" in out
+    assert make(text, "--name", "other", "--set", "board=32bit")[1].count("compensated") == 0
+
+
+def test_marlin_1_0_has_other_words(make, capsys) -> None:
+    """Such an answer was said to be incomplete, and to be sent again."""
+    text = MK3.replace("P1250.00 R1250.00 T1250.00", "S1250.00 T1500.00").replace(" Y8.00", "")
+    assert make(text)[0] == 0
+    planner = stored(capsys).firmware.planner
+    assert (planner.accel_mm_s2, planner.travel_accel_mm_s2) == (1250.0, 1250.0)
+    assert (planner.retract_accel_mm_s2, planner.jerk_mm_s.y) == (1500.0, 8.0)
+
+
+def test_an_mk3_has_the_limits_of_its_normal_mode(make, capsys) -> None:
+    make(MK3)
+    planner = stored(capsys).firmware.planner
+    assert (planner.max_feedrate_mm_s.x, planner.max_accel_mm_s2.y) == (200.0, 1250.0)
+
+
+def test_an_mk3_says_how_it_cuts_arcs(make, capsys) -> None:
+    """With the 72 pieces a circle that Marlin makes, a circle of 2 mm took a third less."""
+    make(MK3)
+    firmware = stored(capsys).firmware
+    assert (firmware.arc_resolution_mm, firmware.min_arc_segment_mm) == (1.0, 0.5)
+    assert firmware.min_circle_segments == 20
+    assert make(MK3.replace("P1.00 S0.50 N25 R20", "P1.00 S0.00 N25 R0"), "--name", "other")[0] == 0
+
+
 def test_axes_that_begin_beside_the_bed(make, capsys) -> None:
     """Start codes of Creality's printers draw a line at X-2.1 there."""
     assert make(M503, "--travel=-4:220x-17:227x250")[0] == 0

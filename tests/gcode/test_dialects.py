@@ -301,6 +301,16 @@ def test_pieces_of_arcs(read) -> None:
     assert counts == {"klipper": 31, "marlin": 72, "marlin-2.0": 72, "reprapfirmware": 71}
 
 
+@pytest.mark.parametrize(("feed", "pieces"), [(6000, 35), (600, 157), (60, 314)])
+def test_pieces_of_arcs_of_a_buddy(read, feed: int, pieces: int) -> None:
+    """Its own rule: sqrt(8 * 5 * 0.02) = 0.894 mm, at least 50 a second, at least .1 mm.
+
+    They were cut as Marlin cuts them, and a circle of 10 mm was planned a quarter too fast.
+    """
+    block, _ = read(f"G1 X10 F{feed}\nG2 I-5\n", "prusa")
+    assert len(block.moves) - 1 == pieces
+
+
 def test_limits(read) -> None:
     text = "M201 X1000 E5000\nM203 X300\nM204 P1500 T2500\nM205 X8 B0 J0.02\nM204 S700\n"
     block, _ = read(text, "marlin")

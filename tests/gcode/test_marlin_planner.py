@@ -312,7 +312,7 @@ def test_the_queue_sees_thirteen_blocks() -> None:
     # .1 mm each: from the start of a block the firmware must be able to brake within it and
     # the twelve after it: v2 = 2 * 500 * 1.3 = 1300, 36.06 mm/s, whatever F says.
     points = 0.1 * np.arange(400.0)[:, None]
-    facts = {"variant": "prusa", "slowdown": False, "junction": "classic_jerk"}
+    facts = {"variant": "bambu", "slowdown": False, "junction": "classic_jerk"}
     phases = plan(machine(**facts), points, 100.0)
     assert phases.start_mm_s[200] == pytest.approx(math.sqrt(1300.0), rel=1e-4)
     large = machine(**facts, block_buffer_size=64)

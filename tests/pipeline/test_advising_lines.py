@@ -22,6 +22,7 @@ from stillpath.models.shaping import OFF, AxisShaper, Shaping
 from stillpath.models.store import load_machine
 from stillpath.pipeline.advising.advice import Advice, Bound
 from stillpath.pipeline.advising.inserting import MARK, AdviceWriter, write_advised
+from stillpath.pipeline.advising.messages import shaper_warnings
 from stillpath.pipeline.advising.removing import remove_advice
 from stillpath.pipeline.measuring.points import MotionSamples
 from stillpath.pipeline.shaping import ShapedMotion
@@ -172,6 +173,25 @@ def test_m493_of_both_versions(version: int, lines: list[bytes], own: str) -> No
         found = adviser.read_shaper(line, found)
     y_damping = {1: 0.05, 2: 0.1}[version]
     assert found == Shaping(AxisShaper("zv", 37.0, 0.2), AxisShaper("zv", 38.0, y_damping))
+
+
+def test_m593_of_a_buddy_names_the_type() -> None:
+    """T is the type, and F0 or Z leaves the others; all of them were read as ZV of both axes."""
+    machine = klipper().model_copy(update={"firmware": Marlin(variant="prusa")})
+    adviser = adapter(machine).adviser(Interpreter(machine).dialect)
+    found = OFF
+    for line in ("M593 X T3 F60", "M593 Y F40.6 D.05", "M593 Z F30"):
+        found = adviser.read_shaper(line, found)
+    assert found == Shaping(AxisShaper("ei", 60.0), AxisShaper("mzv", 40.6, 0.05))
+    assert adviser.read_shaper("M593 X T1 F50", found).unknown_types == ["zvd"]
+    assert not adviser.read_shaper("M593 T2 F0", found).is_on
+
+
+def test_a_shaper_that_nobody_stated_is_warned_of() -> None:
+    """A Buddy has its own, and the figures of its file were those of a printer with none."""
+    said = shaper_warnings([], none_known=True, stated=False, left=False)
+    assert "rings less than these figures" in said[-1]
+    assert len(shaper_warnings([], none_known=True, stated=True, left=False)) == 1
 
 
 @pytest.mark.parametrize("kind", ["zv", "ei", "3hump_ei"])

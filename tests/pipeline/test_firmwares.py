@@ -166,6 +166,22 @@ def test_a_file_for_another_firmware_is_doubted(tmp_path: Path, cache: Path) -> 
     assert warning in compensated(data, tmp_path, cache, marlin)[0].warnings
 
 
+def test_files_of_prusas_printers_are_doubted(tmp_path: Path) -> None:
+    """Neither an MK4 nor an MK3 can execute what is written for a Marlin machine."""
+    source, motion = tmp_path / "in.gcode", tmp_path / "m.npz"
+    marlin = ender3_with("marlin")
+    source.write_bytes(b"; printer_model = MK4S\nM555 X1\n" + body("marlin"))
+    (warning,) = plan_file(source, motion, marlin).warnings
+    assert "if the printer runs Prusa's own firmware" in warning
+    assert "set variant to prusa in its machine" in warning
+    source.write_bytes(b'; printer_model = MK3SMMU3\nM862.3 P "MK3S"\n' + body("marlin"))
+    (warning,) = plan_file(source, motion, marlin).warnings
+    assert "set board to avr in the machine" in warning
+    avr = marlin.firmware.model_copy(update={"board": "avr"})
+    assert plan_file(source, motion, marlin.model_copy(update={"firmware": avr})).warnings == []
+    assert plan_file(source, motion, load_machine("ender3")).warnings == []
+
+
 def test_klipper_reads_marlins_flavour(tmp_path: Path) -> None:
     source = tmp_path / "in.gcode"
     source.write_bytes(b"; gcode_flavor = marlin2\nM205 X8 Y8\nM900 K.05\n" + body("marlin"))

@@ -57,11 +57,14 @@ L_ADVANCE, L_IN_FILAMENT = 19, 20
 # Facts of the machine.
 C_STEPS_PER_MM = 0  # x y z e
 C_FAMILY, C_CORE, C_CLASSIC_JERK, C_SMALL_SEGMENTS = 4, 5, 6, 7
-C_MIN_STEPS, C_QUEUE, C_SLOWDOWN, C_MIN_SPEED, C_ADVANCE = 8, 9, 10, 11, 12
+C_MIN_STEPS, C_MIN_SPEED, C_ADVANCE = 8, 11, 12
+C_AHEAD = 9  # blocks after a block that are known when it starts
+C_SLOWDOWN = 10  # most waiting blocks for which short ones are stretched; 0: never
 C_TIMER_HZ, C_SMOOTHING_HZ, C_MIN_RATE, C_S_CURVE = 13, 14, 15, 16
 C_RESTS_APART = 17  # short moves are not joined with moves of Z or the extruder alone
 C_FIRST_STEPS = 18  # steps of a block that have the time of its first one
-C_SIZE = 19
+C_MOTOR_SPEED = 19  # X and Y together are no faster than M203 X
+C_SIZE = 20
 
 RELEASE, BUGFIX, PRUSA = 0, 1, 2
 
@@ -112,7 +115,6 @@ def append(
     count, problem, move : int
         New number of rows; OK or what is wrong with which move.
     """
-    rounds = facts[C_FAMILY] != PRUSA
     apart, last = facts[C_RESTS_APART] != 0.0, len(speed) - 1
     for m in range(len(speed)):
         row = queue[count]
@@ -125,8 +127,7 @@ def append(
         # After homing, G92 of an axis and the like the machine is where the file says.
         for k in range(4):
             if state[S_KNOWN] == 0.0 or abs(start[m, k] - state[S_ASKED + k]) > _SAME_MM:
-                scaled = start[m, k] * facts[C_STEPS_PER_MM + k]
-                state[S_STEPS + k] = _whole(scaled) if rounds else scaled
+                state[S_STEPS + k] = _whole(start[m, k] * facts[C_STEPS_PER_MM + k])
                 state[S_POSITION + k] = start[m, k]
             state[S_ASKED + k] = end[m, k]
         state[S_KNOWN] = 1.0
@@ -151,18 +152,16 @@ def _block(
     family = facts[C_FAMILY]
     rounds = family != PRUSA
     core = facts[C_CORE] != 0.0
-    s0 = end[0] * facts[C_STEPS_PER_MM]
-    s1 = end[1] * facts[C_STEPS_PER_MM + 1]
-    s2 = end[2] * facts[C_STEPS_PER_MM + 2]
-    s3 = end[3] * facts[C_STEPS_PER_MM + 3]
-    if rounds:
-        s0, s1, s2, s3 = _whole(s0), _whole(s1), _whole(s2), _whole(s3)
+    s0 = _whole(end[0] * facts[C_STEPS_PER_MM])
+    s1 = _whole(end[1] * facts[C_STEPS_PER_MM + 1])
+    s2 = _whole(end[2] * facts[C_STEPS_PER_MM + 2])
+    s3 = _whole(end[3] * facts[C_STEPS_PER_MM + 3])
     d0, d1 = s0 - state[S_STEPS], s1 - state[S_STEPS + 1]
     d2, d3 = s2 - state[S_STEPS + 2], s3 - state[S_STEPS + 3]
     x_mm, y_mm = d0 / facts[C_STEPS_PER_MM], d1 / facts[C_STEPS_PER_MM + 1]
     z_mm, e_mm = d2 / facts[C_STEPS_PER_MM + 2], d3 / facts[C_STEPS_PER_MM + 3]
     # Steps and millimetres of the motors; of a CoreXY they are sum and difference, of Prusa's
-    # firmware, whose limits are those of the axes, they are not.
+    # firmware, whose limits but M203 are those of the axes, they are not.
     motors = core and family != PRUSA
     a, b = (abs(d0 + d1), abs(d0 - d1)) if motors else (abs(d0), abs(d1))
     a_mm, b_mm = (x_mm + y_mm, x_mm - y_mm) if motors else (x_mm, y_mm)
@@ -181,7 +180,7 @@ def _block(
     blocks = state[S_BLOCKS]
     # The first block is taken from the queue when there are three.
     queued = blocks if blocks <= 2.0 else blocks - 1.0
-    if facts[C_SLOWDOWN] != 0.0 and 2.0 <= queued <= 0.5 * facts[C_QUEUE] - 1.0:
+    if 2.0 <= queued <= facts[C_SLOWDOWN]:
         segment_us = _whole(1e6 / inverse_s)
         short_us = floor(limit[L_MIN_SEGMENT_US] - segment_us)
         if short_us > 0.0:
@@ -190,10 +189,14 @@ def _block(
     rate = _up(steps * inverse_s) if rounds else steps * inverse_s
     v0, v1, v2, v3 = a_mm * inverse_s, b_mm * inverse_s, z_mm * inverse_s, e_mm * inverse_s
     factor = 1.0
-    if abs(v0) > limit[L_FEEDRATE]:
-        factor = min(factor, limit[L_FEEDRATE] / abs(v0))
-    if abs(v1) > limit[L_FEEDRATE + 1]:
-        factor = min(factor, limit[L_FEEDRATE + 1] / abs(v1))
+    if facts[C_MOTOR_SPEED] != 0.0:
+        if abs(v0) + abs(v1) > limit[L_FEEDRATE]:
+            factor = limit[L_FEEDRATE] / (abs(v0) + abs(v1))
+    else:
+        if abs(v0) > limit[L_FEEDRATE]:
+            factor = min(factor, limit[L_FEEDRATE] / abs(v0))
+        if abs(v1) > limit[L_FEEDRATE + 1]:
+            factor = min(factor, limit[L_FEEDRATE + 1] / abs(v1))
     if abs(v2) > limit[L_FEEDRATE + 2]:
         factor = min(factor, limit[L_FEEDRATE + 2] / abs(v2))
     if abs(v3) > limit[L_FEEDRATE + 3]:

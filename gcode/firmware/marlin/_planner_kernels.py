@@ -1,6 +1,6 @@
 """Kernels of Marlin's planner: look-ahead of a finite queue, trapezoids, and their step timing.
 
-When a block starts, the firmware knows the `C_QUEUE` - 3 blocks after it that its full queue
+When a block starts, the firmware knows the `C_AHEAD` blocks after it that its full queue
 holds; the last of them is planned to end at the lowest speed. With prefix sums of 2 a d that is the
 same as one backward pass over everything and a cap for each block.
 
@@ -22,10 +22,10 @@ import numpy as np
 
 from stillpath.gcode.firmware.marlin._block_kernels import (
     BUGFIX,
+    C_AHEAD,
     C_FAMILY,
     C_FIRST_STEPS,
     C_MIN_RATE,
-    C_QUEUE,
     C_S_CURVE,
     C_SMOOTHING_HZ,
     C_TIMER_HZ,
@@ -66,7 +66,7 @@ def settle(queue: Any, count: int, facts: Any, final: bool) -> int:
         if queue[m, Q_STEPS] > 0.0:
             blocks[n] = m
             n += 1
-    ahead = int(facts[C_QUEUE]) - 3
+    ahead = int(facts[C_AHEAD])
     settled = count
     if not final:
         if n <= ahead:

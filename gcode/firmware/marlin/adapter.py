@@ -87,8 +87,8 @@ class MarlinAdapter:
             )
         if firmware.board == "avr":
             return (
-                "an 8-bit board computes step rates in 16 bits and takes some hundred segments a "
-                "second at most; print from a 32-bit board, or " + _ALTERNATIVE
+                "an 8-bit board (`board` avr) computes step rates in 16 bits and takes some "
+                "hundred segments a second at most; print from a 32-bit board, or " + _ALTERNATIVE
             )
         deviation_mm = firmware.planner.junction_deviation_mm
         low, high = DEVIATION_MM

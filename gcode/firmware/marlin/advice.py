@@ -17,6 +17,8 @@ __all__ = ["MarlinAdviser"]
 _WITH_SHAPER = ("2.1", "bugfix")
 _COMPENSATORS = {"zv": 1, "ei": 5, "2hump_ei": 6, "3hump_ei": 7, "mzv": 8}
 """Our names to M493 C. ZVD, ZVDD and ZVDDD have no model here."""
+_BUDDY_TYPES = ("zv", "zvd", "mzv", "ei", "2hump_ei", "3hump_ei")
+"""M593 T of Prusa's Buddy; without T the type stays, at first MZV (EI on a CORE One)."""
 _MODELLED = {str(number): name for name, number in _COMPENSATORS.items()} | {"0": "none"}
 
 
@@ -49,6 +51,7 @@ class MarlinAdviser:
         elif firmware.variant == "2.0":
             self.stated = OFF
         self._fixed_time = firmware.ft_motion
+        self._buddy = firmware.variant == "prusa"
         self._version = firmware.ft_motion_version
         self.shaper_word = "M493" if self._fixed_time else "M593"
         if self._fixed_time:
@@ -110,7 +113,7 @@ class MarlinAdviser:
             if self._fixed_time and self._version == 1:
                 now = _read_version_1(command, now)
                 continue
-            both = not command.words.keys() & {"X", "Y"}
+            both = not command.words.keys() & ({"X", "Y", "Z"} if self._buddy else {"X", "Y"})
             hertz, zeta = ("A", "I") if self._fixed_time else ("F", "D")
             given = {k: float(v) for k, v in command.words.items() if k in (hertz, zeta) and v}
             axes = []
@@ -118,12 +121,19 @@ class MarlinAdviser:
                 if not both and axis not in command.words:
                     axes.append(s)
                     continue
-                kind = self._type(command, s.type) if self._fixed_time else "zv"
+                kind = self._type(command, s.type)
                 axes.append(AxisShaper(kind, given.get(hertz, s.f_hz), given.get(zeta, s.damping)))
             now = Shaping(*axes)
         return now
 
     def _type(self, command: Command, now: str) -> str:
+        if self._buddy:
+            number = int(float(command.words.get("T") or -1))
+            if 0 <= number < len(_BUDDY_TYPES):
+                return _BUDDY_TYPES[number]
+            return "mzv" if now == "none" else now
+        if not self._fixed_time:
+            return "zv"
         mode = command.words.get("C", "")
         return _MODELLED.get(mode, f"M493 C{mode}") if mode else now
 

@@ -28,6 +28,11 @@ _FAMILY = {
     "prusa": blocks.PRUSA,
     "bambu": blocks.PRUSA,
 }
+_PRUSA_PARTS = 4
+"""PLANNER_STEPS_MULTIPLIER: positions are rounded to a quarter of a step."""
+_PRUSA_AHEAD = 15
+"""Half of BLOCK_BUFFER_SIZE, 32 of all printers since 5.0, whatever the document assumes: the other
+half is steps already (PreciseStepping::is_waiting_before_delivering)."""
 _RELEASE_MIN_RATE_HZ = 120.0
 """MINIMAL_STEP_RATE of 2.0 and 2.1; bugfix has what the timer can hold."""
 
@@ -115,15 +120,27 @@ def planner_facts(firmware: Marlin, *, corexy: bool) -> NDArray[np.float64]:
     """Return the machine's facts in the kernels' order (``C_`` entries)."""
     facts = np.zeros(blocks.C_SIZE)
     scale = firmware.steps_per_mm
-    facts[blocks.C_STEPS_PER_MM : blocks.C_STEPS_PER_MM + 4] = scale.x, scale.y, scale.z, scale.e
     family = _FAMILY[firmware.variant]
+    parts = _PRUSA_PARTS if family == blocks.PRUSA else 1
+    facts[blocks.C_STEPS_PER_MM : blocks.C_STEPS_PER_MM + 4] = (
+        parts * scale.x,
+        parts * scale.y,
+        parts * scale.z,
+        parts * scale.e,
+    )
     facts[blocks.C_FAMILY] = family
     facts[blocks.C_CORE] = corexy
     facts[blocks.C_CLASSIC_JERK] = firmware.junction == "classic_jerk"
     facts[blocks.C_SMALL_SEGMENTS] = firmware.small_segment_junctions
-    facts[blocks.C_MIN_STEPS] = firmware.min_steps_per_segment
-    facts[blocks.C_QUEUE] = firmware.block_buffer_size
-    facts[blocks.C_SLOWDOWN] = firmware.slowdown
+    facts[blocks.C_MIN_STEPS] = parts * firmware.min_steps_per_segment
+    facts[blocks.C_AHEAD] = firmware.block_buffer_size - 3
+    facts[blocks.C_SLOWDOWN] = 0.5 * firmware.block_buffer_size - 1.0 if firmware.slowdown else 0.0
+    if firmware.variant == "prusa":
+        # It slows down only where the file comes too slowly, and M203 X holds for the motors A and
+        # B (COREXY_CONVERT_LIMITS; both Planner::_populate_block). Of Bambu's that is not known.
+        facts[blocks.C_AHEAD] = _PRUSA_AHEAD
+        facts[blocks.C_SLOWDOWN] = 0.0
+        facts[blocks.C_MOTOR_SPEED] = corexy
     facts[blocks.C_MIN_SPEED] = firmware.minimum_planner_speed_mm_s
     facts[blocks.C_ADVANCE] = bool(firmware.linear_advance)
     facts[blocks.C_TIMER_HZ] = firmware.step_timer_hz
