@@ -248,6 +248,18 @@ def test_a_printer_without_a_shaper():
     assert printer.told == ["Stillpath: PAUSE, RESUME and CANCEL_PRINT restore the limits first"]
 
 
+def test_a_shaper_that_printer_cfg_does_not_state_is_left_alone():
+    """Of two carriages: Klipper refuses frequencies in [input_shaper], [delayed_gcode] has them."""
+    carriages = copy.deepcopy(SETTINGS)
+    carriages["input_shaper"] = {"shaper_freq_x": 0.0, "shaper_freq_y": 0.0, "shaper_type_x": "mzv"}
+    printer = Klipper(macros_of(USERS, OURS), settings=carriages)
+    printer.run("SET_INPUT_SHAPER SHAPER_TYPE_X=ei SHAPER_FREQ_X=61 SHAPER_FREQ_Y=45")
+    for command in ("PAUSE", "RESUME", "CANCEL_PRINT", "STILLPATH_RESTORE", "STILLPATH_CHECK"):
+        printer.run(command)
+        assert float(printer.shaper["shaper_freq_x"]) == 61.0, command
+    assert printer.toolhead["max_accel"] == carriages["printer"]["max_accel"]
+
+
 def test_check_is_content():
     printer = Klipper(macros_of(USERS, CHANGES, OURS, M600))
     printer.run("STILLPATH_CHECK STOP=1")
