@@ -257,7 +257,12 @@ def test_a_shaper_that_printer_cfg_does_not_state_is_left_alone():
     for command in ("PAUSE", "RESUME", "CANCEL_PRINT", "STILLPATH_RESTORE", "STILLPATH_CHECK"):
         printer.run(command)
         assert float(printer.shaper["shaper_freq_x"]) == 61.0, command
+    assert not any("stays off" in line for line in printer.told)
+    carriages["dual_carriage"] = {"axis": "x"}
+    printer = in_stretch(USERS, OURS, settings=carriages)
+    printer.run("CANCEL_PRINT")
     assert printer.toolhead["max_accel"] == carriages["printer"]["max_accel"]
+    assert any("the shaper stays off" in line for line in printer.told)
 
 
 def test_check_is_content():
