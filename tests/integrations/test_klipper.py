@@ -265,6 +265,15 @@ def test_a_shaper_that_printer_cfg_does_not_state_is_left_alone():
     assert any("the shaper stays off" in line for line in printer.told)
 
 
+def test_what_ones_own_macros_rename_is_still_told():
+    """timelapse.cfg parks with what `gcode_macro pause` renames in the settings, in lower case."""
+    told: dict[str, dict[str, str]] = {}
+    for section, options in macros_of(USERS, OURS):
+        told.setdefault(section.lower(), {}).update(options)
+    for name in ("pause", "resume", "cancel_print"):
+        assert told[f"gcode_macro {name}"]["rename_existing"] == f"{name.upper()}_BASE"
+
+
 def test_check_is_content():
     printer = Klipper(macros_of(USERS, CHANGES, OURS, M600))
     printer.run("STILLPATH_CHECK STOP=1")
@@ -326,7 +335,7 @@ def test_check_finds_wrappers_that_are_missing(files, words: str, shows_commands
 
 @pytest.mark.parametrize("shows_commands", [True, False])
 def test_check_finds_a_wrapper_that_was_cut_out(shows_commands: bool):
-    text = re.sub(r"\[gcode_macro Cancel_Print\].*?(?=\n\[)", "", OURS.read_text(), flags=re.S)
+    text = re.sub(r"\[gcode_macro\tCancel_Print\].*?(?=\n\[)", "", OURS.read_text(), flags=re.S)
     printer = Klipper(macros_of(text), shows_commands=shows_commands)
     printer.run("STILLPATH_CHECK")
     assert [line for line in printer.told if line.startswith("Stillpath: CANCEL_PRINT does not")]
