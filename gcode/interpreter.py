@@ -104,6 +104,11 @@ class Interpreter:
         return [f"line {line}: {text}" for text, line in self.state.warnings.items()]
 
     @property
+    def macro_with_limits(self) -> tuple[str, int] | None:
+        """Name and line of a macro whose limits may be meant: the file states no acceleration."""
+        return None if self.state.states_acceleration else self.state.first_macro
+
+    @property
     def position_mm(self) -> NDArray[np.float64]:
         """Where the firmware believes the tool is: x y z e, shape (4,)."""
         return self.state.f[at.F_LAST : at.F_LAST + 4].copy()
@@ -336,7 +341,8 @@ class Interpreter:
         if isinstance(word, Action):
             return self._classic(word, name, command)
         if isinstance(word, EventKind):
-            state.macro_ran = state.macro_ran or word == EventKind.UNKNOWN
+            if word == EventKind.UNKNOWN:
+                state.called(name)
             state.remember(command, at.MEMO_EVENT, int(word))
             return state.event(word)
         return word(state, command)

@@ -92,6 +92,10 @@ class MachineState:
         The machine is one with a laser (M452).
     cutter_on : bool
         A spindle or laser is on (M3, M4), or may be at any move (`laser_mode`).
+    macro_ran, states_acceleration : bool
+        The file has called what may be a macro of the printer; it has set an acceleration.
+    first_macro : tuple of str and int, optional
+        The first one of an unknown name, and its line.
     warnings : dict of str to int
         What the firmware skips or what is unknown, with the line of first occurrence.
     """
@@ -114,8 +118,8 @@ class MachineState:
         """By tool, and I_MACROS when that was known; Klipper has one state for all."""
         self.hop_mm = 0.0
         self.factors: dict[str, float] = {}
-        self.macro_ran = False
-        """The file has called what may be a macro of the printer."""
+        self.macro_ran = self.states_acceleration = False
+        self.first_macro: tuple[str, int] | None = None
         self.held: dict[str, bool] = {}
         self.laser_mode = self.cutter_on = False
         self.tool_known = dialect.tool_at_start
@@ -169,6 +173,12 @@ class MachineState:
         return other
 
     # What a line does
+
+    def called(self, name: str) -> None:
+        """Note what may be a macro of the printer."""
+        self.macro_ran = True
+        if self.first_macro is None and name not in self.dialect.words:
+            self.first_macro = name, int(self.i[at.I_LINE])
 
     def event(self, kind: EventKind, dwell_s: float = 0.0) -> int:
         """Write the line in hand as an event."""
@@ -259,6 +269,7 @@ class MachineState:
     ) -> int:
         """Set limits by name, and remember that this line does so in millimetres."""
         row = np.full(len(self.limits_names), np.nan)
+        self.states_acceleration |= "accel_mm_s2" in values
         for name, value in values.items():
             row[self.limits_names.index(name)] = value
         limits = self.f[at.F_LIMITS : at.F_LIMITS + len(row)]

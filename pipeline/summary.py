@@ -135,6 +135,7 @@ class Summary:
             yield prediction_note(self.machine, self.choice)
         yield from self.operation.notes()
         if self.writer is not None:
+            yield from self._macro_with_limits()
             yield from self.totals.left_out(self.options.where)
             if self.options.max_mb is not None:
                 yield (
@@ -143,6 +144,18 @@ class Summary:
                 )
         if self.budget is not None:
             yield self.budget[1].note
+
+    def _macro_with_limits(self) -> Iterator[str]:
+        """Yield a note where a macro may have set the acceleration that was meant."""
+        firmware, called = self.machine.firmware, self.reader.macro_with_limits
+        if firmware.kind == "klipper" and called is not None and self.totals.extruding_s > 0.0:
+            name, line = called
+            yield (
+                f"The file states no acceleration, so it is planned with printer.cfg's "
+                f"{firmware.largest_accel_mm_s2:g} mm/s2, which compensated stretches put in force "
+                f"behind them. If {name} (line {line}) or another macro sets another, its setting "
+                "is not seen, and lost: let the slicer write it (SET_VELOCITY_LIMIT ACCEL=...)"
+            )
 
     def _other_heads(self, facts: SlicerFacts) -> Iterator[str]:
         """Yield a warning where several tools print that may be heads of their own."""

@@ -299,6 +299,11 @@ def _shaper(config: PrinterConfig) -> list[Fact]:
     section, place = "input_shaper", "firmware.shaper"
     if section not in config.sections:
         return [] if config.includes else [Fact(section, "", place, None)]
+    rates = [option for option in config.sections[section] if option[:-1].endswith("_freq_")]
+    if "dual_carriage" in config.sections and not any(config.number(section, o) for o in rates):
+        # Newer Klippers take each carriage's shaper from SET_INPUT_SHAPER alone, in [delayed_gcode]
+        # (klippy/extras/input_shaper.py, 2026-08): what is in force is unknown, not off.
+        return []
     common = config.text(section, "shaper_type", "mzv")
     found = []
     for axis in "xy":

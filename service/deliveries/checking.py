@@ -414,8 +414,9 @@ def _no_shaper(asked: PrinterState) -> Iterator[Finding]:
 
 def _unwrapped(asked: PrinterState) -> Iterable[str]:
     if asked.commands is None:
-        # Of macros of one name the last one counts.
-        last = {name.upper(): name for name in asked.sections}
+        # Of macros of one name the last one counts. Those of stillpath.cfg have a tab in between.
+        titles = [" ".join(name.split()) for name in asked.sections]
+        last = {title.upper(): title for title in titles}
         return [
             name
             for name in _WRAPPED

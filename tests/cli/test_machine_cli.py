@@ -428,6 +428,22 @@ def test_the_travel_is_that_of_both_carriages(store: MachineStore, config: Path)
     assert (difference.section, difference.option) == ("dual_carriage", "position_max")
 
 
+def test_the_shaper_of_two_carriages_is_unknown(store: MachineStore, config: Path):
+    """Klipper refuses frequencies in [input_shaper] then: macros set one for each carriage."""
+    plain = CONFIG.partition("[input_shaper]")[0].replace("corexy", "cartesian")
+    empty, second = "[input_shaper]\nshaper_freq_x: 0.0\n", "[dual_carriage]\naxis: x\n"
+    for text, stated in ((empty, True), (empty + second + "position_max: 310\n", False)):
+        config.write_text(plain + text)
+        name = "one" if stated else "two"
+        assert machines("from-config", config, "--name", name) == 0
+        machine = store.current(name).machine
+        assert (machine.firmware.shaper is not None) is stated  # type: ignore[union-attr]
+        assert not differences(machine, read_printer_config(config))
+    config.write_text(config.read_text() + "[input_shaper]\nshaper_freq_x: 60\n")
+    found = differences(machine, read_printer_config(config))
+    assert "shaper_freq_x" in [difference.option for difference in found]
+
+
 @pytest.mark.parametrize("hertz", ["inf", "nan", "1e101", "501"])
 def test_resonances_that_are_none(store: MachineStore, config: Path, capsys, hertz: str):
     assert machines("from-config", config, "--name", "mine", "--fx", hertz) == 2

@@ -132,7 +132,7 @@ class Klipper:
         if "input_shaper" in self.settings:
             self._commands["SET_INPUT_SHAPER"] = self._shape
         for section, options in self.sections:
-            if section.startswith("gcode_macro "):
+            if section.split()[0] == "gcode_macro":
                 self._load(section, options)
             elif section.startswith("delayed_gcode "):
                 self._delayed[section.split()[1]] = options["gcode"]

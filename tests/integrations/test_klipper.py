@@ -248,6 +248,32 @@ def test_a_printer_without_a_shaper():
     assert printer.told == ["Stillpath: PAUSE, RESUME and CANCEL_PRINT restore the limits first"]
 
 
+def test_a_shaper_that_printer_cfg_does_not_state_is_left_alone():
+    """Of two carriages: Klipper refuses frequencies in [input_shaper], [delayed_gcode] has them."""
+    carriages = copy.deepcopy(SETTINGS)
+    carriages["input_shaper"] = {"shaper_freq_x": 0.0, "shaper_freq_y": 0.0, "shaper_type_x": "mzv"}
+    printer = Klipper(macros_of(USERS, OURS), settings=carriages)
+    printer.run("SET_INPUT_SHAPER SHAPER_TYPE_X=ei SHAPER_FREQ_X=61 SHAPER_FREQ_Y=45")
+    for command in ("PAUSE", "RESUME", "CANCEL_PRINT", "STILLPATH_RESTORE", "STILLPATH_CHECK"):
+        printer.run(command)
+        assert float(printer.shaper["shaper_freq_x"]) == 61.0, command
+    assert not any("stays off" in line for line in printer.told)
+    carriages["dual_carriage"] = {"axis": "x"}
+    printer = in_stretch(USERS, OURS, settings=carriages)
+    printer.run("CANCEL_PRINT")
+    assert printer.toolhead["max_accel"] == carriages["printer"]["max_accel"]
+    assert any("the shaper stays off" in line for line in printer.told)
+
+
+def test_what_ones_own_macros_rename_is_still_told():
+    """timelapse.cfg parks with what `gcode_macro pause` renames in the settings, in lower case."""
+    told: dict[str, dict[str, str]] = {}
+    for section, options in macros_of(USERS, OURS):
+        told.setdefault(section.lower(), {}).update(options)
+    for name in ("pause", "resume", "cancel_print"):
+        assert told[f"gcode_macro {name}"]["rename_existing"] == f"{name.upper()}_BASE"
+
+
 def test_check_is_content():
     printer = Klipper(macros_of(USERS, CHANGES, OURS, M600))
     printer.run("STILLPATH_CHECK STOP=1")
@@ -309,7 +335,7 @@ def test_check_finds_wrappers_that_are_missing(files, words: str, shows_commands
 
 @pytest.mark.parametrize("shows_commands", [True, False])
 def test_check_finds_a_wrapper_that_was_cut_out(shows_commands: bool):
-    text = re.sub(r"\[gcode_macro Cancel_Print\].*?(?=\n\[)", "", OURS.read_text(), flags=re.S)
+    text = re.sub(r"\[gcode_macro\tCancel_Print\].*?(?=\n\[)", "", OURS.read_text(), flags=re.S)
     printer = Klipper(macros_of(text), shows_commands=shows_commands)
     printer.run("STILLPATH_CHECK")
     assert [line for line in printer.told if line.startswith("Stillpath: CANCEL_PRINT does not")]

@@ -151,6 +151,18 @@ def test_without_our_macros_they_have_the_streams(plain: Print, tmp_path: Path) 
     assert added(moves, plain.moves)[:, ACCEL].max() == plain.of_streams_mm_s2
 
 
+def test_other_macros_find_what_ones_own_rename(plain: Print, tmp_path: Path) -> None:
+    """As timelapse.cfg does, to park with it: one's own PAUSE would park, too."""
+    asks = """
+[gcode_macro ASK]
+gcode:
+  {% set own = printer.configfile.settings['gcode_macro pause'].rename_existing %}
+  {action_respond_info('renamed: ' ~ own)}
+"""
+    planned("G28\nASK\n", plain.machine, USERS + OURS + asks, tmp_path)
+    assert "renamed: PAUSE_BASE" in (tmp_path / "klippy.log").read_text()
+
+
 def test_check_in_mid_stream_changes_no_move(plain: Print, tmp_path: Path) -> None:
     text = interrupted(plain.text, "STILLPATH_CHECK")
     moves, _ = planned(text, plain.machine, USERS + OURS, tmp_path)

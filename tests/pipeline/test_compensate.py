@@ -444,3 +444,26 @@ def test_what_the_file_says_at_rest_comes_before_the_next_move(
     lifted = lines.index("G1 Z5.4 F600")
     between = lines[lifted + 1 : lines.index("M106 S90")]
     assert not [line for line in between if line.startswith(("G1 X", "G1 Y"))]
+
+
+@pytest.mark.parametrize(
+    ("line", "name"),
+    [
+        ("START_PRINT BED=60", "START_PRINT (line 1)"),
+        ("M900 K.05\nSTART_PRINT", "START_PRINT (line 2)"),
+        ("START_PRINT\nM204 S1500", None),
+        ("SET_VELOCITY_LIMIT ACCEL=1500\nSTART_PRINT", None),
+        ("BED_MESH_CALIBRATE", None),
+    ],
+)
+def test_a_start_macro_whose_limits_would_be_lost(
+    tmp_path: Path, cache: Path, line: str, name: str | None
+) -> None:
+    """What is written behind a stream is printer.cfg's acceleration, whatever the macro set."""
+    result, written = compensated(line.encode() + b"\n" + SMALL, tmp_path, cache, robust="off")
+    own = b" ACCEL=1500 " if "1500" in line else b" ACCEL=5000 "
+    assert own in written.rpartition(b"stream on")[2]
+    found = [note for note in result.notes if "states no acceleration" in note]
+    assert [note.partition("If ")[2].partition(" or another")[0] for note in found] == (
+        [name] if name else []
+    )

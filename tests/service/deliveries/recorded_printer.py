@@ -78,7 +78,7 @@ def status_of(machine: Machine) -> dict[str, Any]:
         }
     if firmware.arcs:
         settings["gcode_arcs"] = {"resolution": firmware.arc_resolution_mm}
-    macros = ("gcode_macro PAUSE", "gcode_macro Pause", "gcode_macro Resume")
+    macros = ("gcode_macro PAUSE", "gcode_macro\tPause", "gcode_macro Resume")
     return {
         "configfile": {
             "settings": settings,
