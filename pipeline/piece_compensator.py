@@ -57,6 +57,7 @@ _ACCEL_SHARES = (1.0, 0.8, 0.6, 0.5)
 _SOFT_S = (2e-3, 4e-3, 8e-3)
 """Half-widths of the moving mean that rounds corners, tried in turn where they are too sharp."""
 
+_SHORT_QUEUES = {"marlin": "Marlin", "reprapfirmware": "RepRapFirmware"}
 _ROUNDED = 1.0 + 1e-9
 
 
@@ -248,13 +249,14 @@ class PieceCompensator:
         return lead_s + begin_s, tail_s + end_s
 
     def _too_slow(self) -> str:
-        """Return what to do where Marlin, with few moves in its queue, stays below their speed."""
-        if self._machine.firmware.kind != "marlin":
+        """Return what to do where firmware with few moves in its queue stays below their speed."""
+        name = _SHORT_QUEUES.get(self._machine.firmware.kind)
+        if name is None:
             return ""
         return (
-            "; Marlin does not reach the speed of short moves where command.accel_mm_s2 "
-            f"({self._machine.command.accel_mm_s2:g}) is low: measure what the motors bear "
-            "(motor-test), and raise it"
+            f"; {name} does not reach the speed of short moves where command.accel_mm_s2 "
+            f"({self._machine.command.accel_mm_s2:g}) is low: "
+            "raise it to what the motors bear (docs/safety.md)"
         )
 
     def _fit(
