@@ -8,6 +8,7 @@ import json
 import os
 import secrets
 import sys
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from pathlib import Path
@@ -27,6 +28,8 @@ T = TypeVar("T")
 
 _NAME_PART = 40
 """Characters of the target's name in that of its temporary file (names: 255 bytes at most)."""
+_WAITS_S = (0.1, 0.2, 0.5, 1.0, 2.0) if os.name == "nt" else ()
+"""Windows lets nobody rename a file that a virus scanner reads, which lasts for moments."""
 
 
 class Discarding:
@@ -73,7 +76,7 @@ def replacing(target: Path, mode: int | None = None) -> Iterator[Path]:
                 temporary.chmod(mode & 0o7777)
         if handle is not None:
             temporary = _link(handle, target)
-        temporary.replace(target)
+        _put(temporary, target)
     except BaseException as error:
         with contextlib.suppress(OSError):  # an unnamed file cannot and need not be removed
             temporary.unlink(missing_ok=True)
@@ -84,6 +87,15 @@ def replacing(target: Path, mode: int | None = None) -> Iterator[Path]:
     finally:
         if handle is not None:
             os.close(handle)
+
+
+def _put(temporary: Path, target: Path) -> None:
+    for wait_s in _WAITS_S:
+        with contextlib.suppress(PermissionError):
+            temporary.replace(target)
+            return
+        time.sleep(wait_s)
+    temporary.replace(target)
 
 
 def check_unchanged(source: Path, began: os.stat_result) -> None:

@@ -57,6 +57,8 @@ _ACCEL_SHARES = (1.0, 0.8, 0.6, 0.5)
 _SOFT_S = (2e-3, 4e-3, 8e-3)
 """Half-widths of the moving mean that rounds corners, tried in turn where they are too sharp."""
 
+_LOWER = "slice with less of it, or raise that to what the motors bear (docs/safety.md)"
+_SHORT_QUEUES = {"marlin": "Marlin", "reprapfirmware": "RepRapFirmware"}
 _ROUNDED = 1.0 + 1e-9
 
 
@@ -233,7 +235,7 @@ class PieceCompensator:
         gap_mm = deviation(made, encoded.phases)
         reason = strayed(gap_mm, extruding, self._follow_mm, briefly=briefly)
         if reason is not None:
-            raise _Sudden(f"planned by the firmware's rules, {reason}{self._too_slow()}")
+            raise _Sudden(f"planned by the firmware's rules, {reason}{self._too_slow(piece)}")
         return made
 
     def _standing_s(
@@ -247,14 +249,26 @@ class PieceCompensator:
         begin_s, end_s = self._standing.of(phases, groups)
         return lead_s + begin_s, tail_s + end_s
 
-    def _too_slow(self) -> str:
-        """Return what to do where Marlin, with few moves in its queue, stays below their speed."""
-        if self._machine.firmware.kind != "marlin":
+    def _too_slow(self, piece: Piece) -> str:
+        """Return what to do if the file accelerates more than the command may.
+
+        Or where a firmware with few moves in its queue stays below their speed.
+        """
+        command, phases = self._machine.command, piece.phases
+        xy_mm_s2 = np.abs(phases.direction[:, :2]) * phases.accel_mm_s2[:, None]
+        limits = command.of("x").accel_mm_s2, command.of("y").accel_mm_s2
+        for axis, asked, limit in zip("XY", xy_mm_s2.max(axis=0, initial=0.0), limits, strict=True):
+            if asked > _ROUNDED * limit:
+                return (
+                    f"; as sliced, {axis} accelerates by {asked:.0f} mm/s2, more than the "
+                    f"command may ({limit:g}, command.accel_mm_s2): {_LOWER}"
+                )
+        name = _SHORT_QUEUES.get(self._machine.firmware.kind)
+        if name is None:
             return ""
         return (
-            "; Marlin does not reach the speed of short moves where command.accel_mm_s2 "
-            f"({self._machine.command.accel_mm_s2:g}) is low: measure what the motors bear "
-            "(motor-test), and raise it"
+            f"; {name} does not reach the speed of short moves where command.accel_mm_s2 "
+            f"({command.accel_mm_s2:g}) is low: raise it to what the motors bear (docs/safety.md)"
         )
 
     def _fit(
@@ -342,7 +356,7 @@ class PieceCompensator:
             if limit is not None and asked > _ROUNDED * limit:
                 raise _Sudden(
                     f"X and Y together ask a motor for {asked:.0f} {unit}; the machine allows "
-                    f"{limit:.0f} {unit} (command.motors)"
+                    f"{limit:.0f} {unit} (command.motors): {_LOWER}"
                 )
 
     def _check_travel(

@@ -38,9 +38,10 @@ _RESONANCES_HZ, _DAMPING = (1.0, 500.0), (1e-3, 1.0)
 _ACCEL_ROOM, _SPEED_ROOM, _CORNERS = 1.5, 1.2, 6.0
 """Limits assumed for motors where none are stated: these multiples of the acceleration, speed and
 corner speed that the printer allows a file."""
-_MARLIN_ROOM, _MARLIN_MM_S2 = 3.0, 6000.0
-"""Multiple of the acceleration on Marlin, and up to where: with few short moves in its queue it
-does not reach a print's speed on 1.5 times a low limit, and every piece would stay as sliced."""
+_QUEUE_ROOM, _QUEUE_MM_S2 = 3.0, 6000.0
+"""Multiple of the acceleration on Marlin and RepRapFirmware, and up to where: with few short moves
+in their queues they do not reach a print's speed on 1.5 times a low limit, and every piece would
+stay as sliced."""
 _LEAST_STEP_MM_S = 20.0
 _ROUNDING = 1.001
 """Ratio up to which two limits count as equal."""
@@ -316,20 +317,22 @@ def derived_envelope(machine: Machine) -> CommandLimits:
 
 
 def _borne(machine: Machine, allowed: AxisAllowance) -> dict[str, float]:
+    # A command that cannot travel as the printer does comes late behind each travel.
+    accel = max(allowed.accel_mm_s2, allowed.travel_accel_mm_s2)
     step = _CORNERS * allowed.corner_mm_s
     room = 1.0 if _capped(machine) else _SPEED_ROOM
     return {
         "velocity_mm_s": room * allowed.speed_mm_s,
-        "accel_mm_s2": _accel_borne(machine, allowed.accel_mm_s2),
+        "accel_mm_s2": _accel_borne(machine, accel),
         "speed_step_mm_s": min(max(step, _LEAST_STEP_MM_S), CommandLimits().speed_step_mm_s),
     }
 
 
 def _accel_borne(machine: Machine, allowed_mm_s2: float) -> float:
     usual = allowed_mm_s2 if _capped(machine) else _ACCEL_ROOM * allowed_mm_s2
-    if machine.firmware.kind != "marlin":
+    if machine.firmware.kind == "klipper":
         return usual
-    return max(usual, min(_MARLIN_ROOM * allowed_mm_s2, _MARLIN_MM_S2))
+    return max(usual, min(_QUEUE_ROOM * allowed_mm_s2, _QUEUE_MM_S2))
 
 
 def _capped(machine: Machine) -> bool:

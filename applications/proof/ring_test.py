@@ -161,7 +161,7 @@ class RingTest:
         """Return speeds near those wanted, within the limits, at which the axis rings most."""
         travel = self._machine.travel[axis]
         room_mm = travel.max_mm - travel.min_mm - 2 * _MARGIN_MM
-        allowed_mm_s, accel_mm_s2, _ = self._allowed[axis]
+        allowed_mm_s, accel_mm_s2 = self._allowed[axis][:2]
         fastest = min(allowed_mm_s, math.sqrt(max(room_mm, 0.0) * accel_mm_s2 / _CRUISE))
         if room_mm < _SHORTEST_MM or fastest < 0.5 * _SPEEDS_MM_S[0]:
             raise ModelError(

@@ -55,6 +55,8 @@ _FOLDER = "stillpath-post-"
 _PART = ".stillpath.part"
 # Nobody waits for a file that long, and copying one takes seconds.
 _FOLDER_LEFT_S, _PART_LEFT_S = 7 * 86400.0, 3600.0
+# Windows lets nobody rename a file that a virus scanner reads, which lasts for moments.
+_WAITS_S = (0.1, 0.2, 0.5, 1.0, 2.0) if os.name == "nt" else ()
 _SHOWN_EVERY_S, _SAID_EVERY_S = 0.1, 5.0  # on a terminal, elsewhere
 
 
@@ -230,13 +232,22 @@ def replacing(target: Path) -> Iterator[Path]:
             os.fsync(file.fileno())
         with contextlib.suppress(OSError):  # file systems of memory cards know no modes
             temporary.chmod(stat.S_IMODE(target.stat().st_mode) if target.exists() else 0o644)
-        temporary.replace(target)
+        _put(temporary, target)
     except BaseException as error:
         with contextlib.suppress(OSError):
             temporary.unlink()
         if isinstance(error, OSError) and error.errno == errno.ENOSPC:
             error.filename = str(target)  # copying names the file that it reads
         raise
+
+
+def _put(temporary: Path, target: Path) -> None:
+    for wait_s in _WAITS_S:
+        with contextlib.suppress(PermissionError):
+            temporary.replace(target)
+            return
+        time.sleep(wait_s)
+    temporary.replace(target)
 
 
 class PrintJob:

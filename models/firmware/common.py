@@ -45,6 +45,8 @@ class AxisAllowance(NamedTuple):
     """Of moves that print."""
     corner_mm_s: float
     """Through a square corner."""
+    travel_accel_mm_s2: float
+    """Of moves that do not print."""
 
 
 class FirmwareFacts(Document):
@@ -108,7 +110,8 @@ class FirmwareFacts(Document):
 
     def allowance(self, axis: Literal["x", "y"]) -> AxisAllowance:  # noqa: ARG002
         """Return what a file is allowed along X or Y; by default the same."""
-        return AxisAllowance(self.fastest_mm_s, self.largest_accel_mm_s2, self.corner_mm_s)
+        accel = self.largest_accel_mm_s2
+        return AxisAllowance(self.fastest_mm_s, accel, self.corner_mm_s, accel)
 
     def motor_accel_mm_s2(self) -> float:
         """Acceleration that a file can ask of a motor of a CoreXY, on a diagonal.

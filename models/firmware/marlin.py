@@ -203,16 +203,20 @@ class Marlin(FirmwareFacts):
     def allowance(self, axis: Literal["x", "y"]) -> AxisAllowance:
         """Return what a file is allowed along X or Y."""
         planner = self.planner
-        accel = min(planner.accel_mm_s2, getattr(planner.max_accel_mm_s2, axis))
+        accel, travel = (
+            min(most, getattr(planner.max_accel_mm_s2, axis))
+            for most in (planner.accel_mm_s2, planner.travel_accel_mm_s2)
+        )
         corner = self.corner_mm_s
         if self.junction == "classic_jerk":
             corner = getattr(planner.jerk_mm_s, axis)
-        return AxisAllowance(getattr(planner.max_feedrate_mm_s, axis), accel, corner)
+        return AxisAllowance(getattr(planner.max_feedrate_mm_s, axis), accel, corner, travel)
 
     def motor_accel_mm_s2(self) -> float:
         """Return what M201 leaves of the acceleration of a diagonal: it holds for motors."""
-        limit = self.planner.max_accel_mm_s2
-        return min(math.sqrt(2.0) * self.planner.accel_mm_s2, limit.x, limit.y)
+        planner, limit = self.planner, self.planner.max_accel_mm_s2
+        largest = max(planner.accel_mm_s2, planner.travel_accel_mm_s2)
+        return min(math.sqrt(2.0) * largest, limit.x, limit.y)
 
     @property
     def fastest_z_mm_s(self) -> float:

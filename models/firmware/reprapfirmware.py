@@ -108,13 +108,16 @@ class RepRapFirmware(FirmwareFacts):
     def allowance(self, axis: Literal["x", "y"]) -> AxisAllowance:
         """Return what a file is allowed along X or Y."""
         drive: Drive = getattr(self, axis)
-        accel = min(self.print_accel_mm_s2, drive.max_accel_mm_s2)
-        return AxisAllowance(drive.max_speed_mm_s, accel, drive.jerk_mm_s)
+        accel, travel = (
+            min(most, drive.max_accel_mm_s2)
+            for most in (self.print_accel_mm_s2, self.travel_accel_mm_s2)
+        )
+        return AxisAllowance(drive.max_speed_mm_s, accel, drive.jerk_mm_s, travel)
 
     def motor_accel_mm_s2(self) -> float:
         """Return what M201 leaves of the acceleration of a diagonal: it holds for motors, too."""
         least = min(self.x.max_accel_mm_s2, self.y.max_accel_mm_s2)
-        return min(math.sqrt(2.0) * self.print_accel_mm_s2, least)
+        return min(math.sqrt(2.0) * max(self.print_accel_mm_s2, self.travel_accel_mm_s2), least)
 
     @property
     def fastest_z_mm_s(self) -> float:

@@ -13,9 +13,12 @@ from stillpath.cli.main import run
 from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine, read_machine
+from tests.compensating import compensated
 
 EXAMPLES = Path(__file__).parents[2] / "examples" / "firmware"
 KINDS = ("marlin", "reprapfirmware")
+RING = "G1 X80 Y60 E.8 F3000\nG1 X80 Y80 E.8\nG1 X60 Y80 E.8\nG1 X60 Y60 E.8\n"
+TRAVELS = f"G28\nM83\nG1 Z1 F600\nG1 X60 Y60 F9000\n{RING}G1 X140 Y140 F9000\nG1 X60 Y60\n{RING}"
 
 
 @pytest.fixture(autouse=True)
@@ -67,13 +70,40 @@ def test_what_the_motors_bear_is_derived_anew_where_it_was_derived(capsys, tmp_p
     stillpath(capsys, "machines", "from-config", config, "--name", "mine")
     stillpath(capsys, "machines", "set-firmware", "mine", reprap)
     command = read_machine(stillpath(capsys, "machines", "mine")[1]).command
-    assert (command.of("x").accel_mm_s2, command.of("y").accel_mm_s2) == (6000.0, 2250.0)
+    # At least 1.5 times each, and up to 6000 three times: the ring holds few moves.
+    assert (command.of("x").accel_mm_s2, command.of("y").accel_mm_s2) == (6000.0, 4500.0)
     # The built-in machine says 20 000 mm/s2, and that stays; `check` tells the least of both axes.
     stillpath(capsys, "machines", "set-firmware", "ender3", reprap, "--as", "stated")
     stated = read_machine(stillpath(capsys, "machines", "stated")[1]).command
     assert stated == load_machine("ender3").command
     told = " ".join(stillpath(capsys, "machines", "check", "stated")[1:])
-    assert "otherwise put 2250 there" in told
+    assert "otherwise put 4500 there" in told
+
+
+@pytest.mark.parametrize("room", [None, 1.5])
+def test_duets_with_low_accelerations_are_compensated(room, capsys, tmp_path) -> None:
+    """M204 P500 T1000: streams of 1.5 times either fall behind, and the report says why."""
+    section = json.loads((EXAMPLES / "reprapfirmware.json").read_text())
+    section |= {"print_accel_mm_s2": 500.0, "travel_accel_mm_s2": 1000.0}
+    reprap, config = tmp_path / "reprap.json", tmp_path / "printer.cfg"
+    reprap.write_text(json.dumps(section))
+    config.write_text(
+        "[printer]\nkinematics: cartesian\nmax_velocity: 300\nmax_accel: 500\n"
+        + "".join(f"[stepper_{axis}]\nposition_max: 200\n" for axis in "xyz")
+    )
+    stillpath(capsys, "machines", "from-config", config, "--name", "mine", "--fx", 45, "--fy", 29)
+    stillpath(capsys, "machines", "set-firmware", "mine", reprap)
+    machine = read_machine(stillpath(capsys, "machines", "mine")[1])
+    assert machine.command.accel_mm_s2 == 3000.0
+    if room is not None:
+        command = machine.command.model_copy(update={"accel_mm_s2": room * 500.0})
+        machine = machine.model_copy(update={"command": command})
+    folder = tmp_path / "printed"
+    folder.mkdir()
+    result, _ = compensated(TRAVELS, folder, tmp_path / "cache", machine)
+    reasons = [one.reason for one in result.put_back]
+    assert bool(reasons) == (room is not None)
+    assert all("command.accel_mm_s2 (750) is low: raise it" in reason for reason in reasons)
 
 
 def test_a_firmware_that_executes_no_stream_is_told_at_once(capsys, tmp_path) -> None:

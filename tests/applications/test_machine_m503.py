@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -383,10 +384,23 @@ def test_the_command_has_room_above_what_the_printer_allows(make, capsys) -> Non
     assert command.accel_mm_s2 > 30000
 
 
-@pytest.mark.parametrize("room", [None, 1.5])
-def test_low_limits_leave_enough_for_the_print_s_speed(room, make, capsys, tmp_path) -> None:
+@pytest.mark.parametrize(
+    ("room", "limits"),
+    [
+        (None, ("X500.00 Y600.00", "P510.00 R520.00 T530.00")),
+        (1.5, ("X500.00 Y600.00", "P510.00 R520.00 T530.00")),
+        # As 34 of Marlin's example configurations: travel has twice the acceleration.
+        (None, ("X1000.00 Y1000.00", "P500.00 R500.00 T1000.00")),
+    ],
+)
+def test_low_limits_leave_enough_for_the_print_s_speed(
+    room, limits, make, capsys, tmp_path
+) -> None:
     """Marlin's short queue brakes from no more; a machine that was made with less says why."""
-    make(M503.replace("J0.08", "X8 Y8 Z0.4 E5"), "--fx", "45", "--fy", "29")
+    text = M503.replace("J0.08", "X8 Y8 Z0.4 E5")
+    text = re.sub(r"(?<=M201 )X\S+ Y\S+", limits[0], text)
+    text = re.sub(r"(?<=M204 )P\S+ R\S+ T\S+", limits[1], text)
+    make(text, "--fx", "45", "--fy", "29")
     machine = stored(capsys)
     if room is not None:
         command = CommandLimits(accel_mm_s2=room * 500.0)
@@ -394,11 +408,11 @@ def test_low_limits_leave_enough_for_the_print_s_speed(room, make, capsys, tmp_p
     ring = "G1 X80 Y60 E.8 F6000\nG1 X80 Y80 E.8\nG1 X60 Y80 E.8\nG1 X60 Y60 E.8\n"
     folder = tmp_path / "printed"
     folder.mkdir()
-    text = f"G28\nM83\nG1 Z1 F600\nG1 X60 Y60 F6000\n{2 * ring}"
+    text = f"G28\nM83\nG1 Z1 F600\nG1 X60 Y60 F9000\n{ring}G1 X140 Y140 F9000\nG1 X60 Y60\n{ring}"
     result, _ = compensated(text, folder, tmp_path / "cache", machine)
     reasons = [one.reason for one in result.put_back]
     assert len(reasons) == (0 if room is None else 1)
-    assert all("command.accel_mm_s2 (750) is low: measure" in reason for reason in reasons)
+    assert all("command.accel_mm_s2 (750) is low: raise it" in reason for reason in reasons)
 
 
 def test_an_axis_that_may_more_bears_more(make, capsys) -> None:

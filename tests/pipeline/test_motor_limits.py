@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine
-from stillpath.pipeline.piece_compensator import DT_S, CompensatedPiece
+from stillpath.pipeline.piece_compensator import DT_S, CompensatedPiece, Unfit
 from tests.gcode.cutting import HEAD, compensated, ender3_with
 
 ZIGZAG = "".join(
@@ -160,3 +160,10 @@ def test_machines_that_state_nothing_of_it_keep_their_revision() -> None:
     """As 0.1.0 computed it."""
     assert load_machine("ender3").revision == "174c0ed51119"
     assert load_machine("voron-v0").revision == "abfe844ff080"
+
+
+def test_a_slicer_that_accelerates_more_than_the_motors_bear_is_told_so() -> None:
+    """Klipper obeys M204 above max_accel, from which the motors' limits are derived."""
+    machine = with_command(load_machine("ender3"), accel_mm_s2=4500)
+    with pytest.raises(Unfit, match=r"as sliced, X .*: slice with less of it, or raise"):
+        compensated(f"{HEAD}M204 S7000\n{ZIGZAG}", machine)

@@ -23,8 +23,9 @@ __all__ = ["climb_in_long_moves"]
 
 _DIP_STEPS = 0.5
 """Steps of Z by which the fit of a climb may descend."""
-_SHARE = 0.7
-"""Moves with this share of the time that Z needs are kept: merging would cost more."""
+_SHARE, _WHOLE_MM_S2 = 0.7, 12_000.0
+"""Moves with this share of the time that Z needs are kept, as merging would cost more, unless the
+stream accelerates less: then the time lost where Z slows a move is not made up for any more."""
 
 
 def climb_in_long_moves(
@@ -49,10 +50,12 @@ def climb_in_long_moves(
     Segments
         Unchanged: stretches that climb by no step, or up and down, and last vertices.
     """
+    weak = min(limits.accel_x_mm_s2, limits.accel_y_mm_s2) < _WHOLE_MM_S2
+    share = 1.0 if weak else _SHARE
     if classic_jerk:
-        least_s = _SHARE / (per_mm * limits.jerk_z_mm_s), 0.0
+        least_s = share / (per_mm * limits.jerk_z_mm_s), 0.0
     else:
-        least_s = (_SHARE / (per_mm * limits.accel_z_mm_s2) ** 0.5,) * 2
+        least_s = (share / (per_mm * limits.accel_z_mm_s2) ** 0.5,) * 2
     z_mm, keep = segments.end_mm[2].copy(), np.ones(len(segments), np.bool_)
     for group, rows in segments.stretches():
         takes_s = np.diff(np.append(timeline.start_s[group], segments.end_s[rows]))

@@ -27,8 +27,9 @@ _LEAST_SAMPLES = 64
 _BRIDGED_S = 0.01
 """A message of the sensor's board, which nobody sends again, has 8 or 10 samples."""
 _NO_TEST = (
-    "RepRapFirmware has no resonance test of its own: tell which motion was commanded, or record "
-    "command and acceleration together"
+    "RepRapFirmware has no resonance test of its own, and its log does not say what moved: type "
+    "the frequencies in (machines from-config, --fx and --fy) and let verify read the log of a "
+    "ring-test, or record command and acceleration together"
 )
 _KLIPPER = ("accel_x", "accel_y", "accel_z")
 _TRAILER = re.compile(r"rate\s+([\d.]+)\s*,?\s*overflows\s+(\d+)", re.IGNORECASE)
