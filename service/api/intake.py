@@ -41,7 +41,7 @@ from stillpath.service.security.callers import Caller
 from stillpath.service.settings import Settings
 from stillpath.service.storage.base import Storage, StorageError
 from stillpath.service.storage.disk import Disk
-from stillpath.version import __version__
+from stillpath.version import build
 
 __all__ = ["Intake", "Taken"]
 
@@ -106,6 +106,7 @@ class Intake:
         self.folder = settings.data_dir / "incoming"
         self._turns = CapacityLimiter(_STORED_AT_ONCE)
         self._printers_asked = CapacityLimiter(_ASKED_AT_ONCE)
+        build()  # of the code that runs, not of what an update puts in its place
 
     def prepare(self) -> None:
         """Make the folder of uploads on their way, and delete what a killed service left there."""
@@ -399,7 +400,7 @@ def _dedupe_key(wanted: JobQuery, upload: Upload, pinned: PinnedMachine) -> str:
         pinned.machine.revision,
         wanted.options(),
         wanted.batch,  # a list of a batch must be whole
-        __version__,
+        build(),
     )
 
 
