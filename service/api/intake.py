@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import shutil
 import time
 import uuid
@@ -48,6 +49,8 @@ __all__ = ["Intake", "Taken"]
 _STORED_AT_ONCE = 12
 """Uploads that are stored in parallel: this may take minutes, and threads are shared by all
 requests."""
+
+_PLATE = re.compile(r"[1-9][0-9]{0,3}")
 
 _ASKED_AT_ONCE = 8
 """Printers that are queried in parallel before uploads."""
@@ -132,7 +135,7 @@ class Intake:
         Parameters
         ----------
         wanted : JobQuery
-            `print` may also come as a form field, as with OctoPrint.
+            `print` and the plate may also come as form fields, as with OctoPrint.
 
         Raises
         ------
@@ -319,7 +322,8 @@ class Intake:
             raise Problem(
                 422,
                 "Printer required",
-                "`print` needs a printer: name one of /v1/printers as well.",
+                "`print` needs a printer: name one of /v1/printers as well (in a slicer by its "
+                "address), or upload without printing.",
             )
 
     def _earlier(self, caller: Caller, key: str, fingerprint: str) -> Job | None:
@@ -375,9 +379,10 @@ class Intake:
 
 
 def _with_fields(wanted: JobQuery, upload: Upload) -> JobQuery:
-    """Take `print` from the form, as printers' own APIs do.
+    """Take `print` and the plate from the form, as printers' own APIs do.
 
-    Other parameters in the form are refused: they would be ignored without a word.
+    OrcaSlicer names the plate of a package, from 1 (src/slic3r/Utils/OctoPrint.cpp, 2026); other
+    files have none. Other parameters are refused: they would be ignored without a word.
     """
     misplaced = sorted((upload.fields.keys() & JobQuery.model_fields.keys()) - {"print"})
     if misplaced:
@@ -387,9 +392,13 @@ def _with_fields(wanted: JobQuery, upload: Upload) -> JobQuery:
             f"{', '.join(misplaced)}: parameters belong in the address (?{misplaced[0]}=...), and "
             "the form holds the file alone.",
         )
+    taken: dict[str, Any] = {}
     if upload.fields.get("print", "").strip().lower() in ("true", "1", "yes", "on"):
-        return wanted.model_copy(update={"print": True})
-    return wanted
+        taken["print"] = True
+    plate = upload.fields.get("plateindex", "").strip()
+    if wanted.plate is None and _PLATE.fullmatch(plate) and upload.name.lower().endswith(".3mf"):
+        taken["plate"] = int(plate)
+    return wanted.model_copy(update=taken) if taken else wanted
 
 
 def _dedupe_key(wanted: JobQuery, upload: Upload, pinned: PinnedMachine) -> str:

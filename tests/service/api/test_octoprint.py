@@ -47,6 +47,26 @@ def test_a_file_for_a_machine(client: TestClient):
     assert_problem(refused, 422, "printer")
 
 
+@pytest.mark.parametrize(
+    ("name", "index", "plate"),
+    [
+        ("gear.gcode.3mf", "2", 2),
+        ("gear.3MF", "10", 10),
+        ("gear.gcode", "2", None),
+        ("gear.gcode.3mf", "", None),
+        ("gear.gcode.3mf", "0", None),
+        ("gear.gcode.3mf", "the first", None),
+    ],
+)
+def test_the_plate_that_orcaslicer_names(
+    client: TestClient, name: str, index: str, plate: int | None
+):
+    sent = FORM | {"plateindex": (None, index), "file": (name, b"G1 X3\n")}
+    answer = client.post("/printers/ender3/api/files/local", files=sent)
+    job = client.get(answer.json()["job"]).json()
+    assert job["options"]["plate"] == plate
+
+
 def test_what_is_wrong(client: TestClient, tmp_path: Path):
     sent = FORM | {"file": ("gear.gcode", b"G1 X2\n")}
     assert_problem(client.post("/printers/nope/api/files/local", files=sent), 404, "nope", "left")
