@@ -21,6 +21,14 @@ def test_the_test_of_the_connection(client: TestClient):
     assert_problem(client.get("/printers/nope/api/version"), 404, "nope", "left")
 
 
+@pytest.mark.parametrize("where", ["/printers/left", "/printers/ender3/", "/printers/ender3"])
+def test_a_browser_at_the_address_of_a_printer_gets_the_page(client: TestClient, where: str):
+    answer = client.get(where)
+    assert answer.status_code == 200
+    assert answer.url.path == "/"
+    assert "<title>Stillpath</title>" in answer.text
+
+
 @pytest.mark.parametrize("where", ["", "/printers/left"])
 def test_a_file_for_a_printer(client: TestClient, where: str):
     sent = FORM | {"print": (None, "false"), "file": ("gear.gcode", b"G1 X1\n")}
