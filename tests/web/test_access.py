@@ -76,12 +76,18 @@ def test_large_letters_need_no_sideways_scrolling(visitor: Visitor, service: Ser
     })"""
     small = {"width": 360, "height": 740}
     job = service.finished(service.submit(PART, "gear.gcode", compare_live="true"))
-    page = visitor.open(
-        f"#/jobs/{job['id']}", viewport=small, script=large, has_touch=True, is_mobile=True
-    )
-    page.get_by_role("button", name="Filter for Klipper").wait_for()
-    wide, inner = page.evaluate("[document.documentElement.scrollWidth, innerWidth]")
-    assert wide <= inner == small["width"]
+    page = visitor.open("#/", viewport=small, script=large, has_touch=True, is_mobile=True)
+    assert page.evaluate("getComputedStyle(document.body).fontSize") == "32px"
+    for view, there in (
+        ("#/", "form"),
+        ("#/jobs", ".job-row"),
+        ("#/machines", ".cards"),
+        (f"#/jobs/{job['id']}", "text=Filter for Klipper"),
+    ):
+        page.goto(f"{visitor.url}/{view}")
+        page.locator(there).first.wait_for()
+        wide, inner = page.evaluate("[document.documentElement.scrollWidth, innerWidth]")
+        assert wide <= inner == small["width"], view
 
 
 def test_the_theme_follows_the_system_and_the_switch(visitor: Visitor, show: Callable[..., Page]):
