@@ -285,7 +285,12 @@ class Client:
 
     def version(self) -> str:
         """Return the version of the service."""
-        return str(self._document(self._connection.ask("GET", "/healthz")).get("version", ""))
+        return str(self._health().get("version", ""))
+
+    def build(self) -> str:
+        """Return its version with a digest of its code; see `stillpath.version.build`."""
+        health = self._health()
+        return str(health.get("build") or health.get("version", ""))
 
     def cancel(self, job_id: str) -> JobView:
         """Stop a job; it stays in the list."""
@@ -315,6 +320,9 @@ class Client:
             return JobView.model_validate_json(answer.content)
         except ValidationError:
             raise self._connection.not_stillpath() from None
+
+    def _health(self) -> dict[str, Any]:
+        return self._document(self._connection.ask("GET", "/healthz"))
 
     def _document(self, answer: httpx2.Response) -> dict[str, Any]:
         found = self._json(answer)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 from pathlib import Path
 
@@ -24,10 +25,18 @@ def private_folder(folder: Path) -> None:
 
 
 def private_file(path: Path) -> None:
-    """Make an empty file that only its owner reads; close one that is there."""
+    """Make an empty file that only its owner reads; close one that is there.
+
+    Raises
+    ------
+    PermissionError
+        If it is another user's: a service that was started by root once leaves such files.
+    """
     with contextlib.suppress(FileExistsError):
         os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
     _close(path, 0o600, _NOT_OWNERS)
+    if not os.access(path, os.R_OK | os.W_OK):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
 
 
 def _close(path: Path, mode: int, unwanted: int) -> None:

@@ -40,7 +40,7 @@ class ServerWorkplace:
         self._options = options
         self._batch = batch
         try:
-            self.version = client.version()
+            self.version = client.build()
         except BaseException:
             client.close()
             raise

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Protocol
 from stillpath.cli.batch.items import Item
 from stillpath.cli.batch.local_workers import Failure, LocalWorker, Made, Stopped, Task, failure_of
 from stillpath.cli.batch.output import Outcome, OutputFolder, Scratch, sha256_of
-from stillpath.version import __version__
+from stillpath.version import build
 
 if TYPE_CHECKING:
     from stillpath.applications.machines.resolve import PinnedMachine, Resolver
@@ -40,7 +40,7 @@ class Workplace(Protocol):
 
     @property
     def version(self) -> str:
-        """Version of the program that does it."""
+        """Version of the program that does it, with a digest of its code."""
 
     def machine(self, name: str) -> Found:
         """Return a machine that may be used now.
@@ -72,9 +72,8 @@ class LocalPool:
         Processes.
     """
 
-    version = __version__
-
     def __init__(self, machines: Resolver, options: Options, jobs: int) -> None:
+        self.version = build()
         self._machines = machines
         self._options = options
         self._workers = [LocalWorker() for _ in range(jobs)]

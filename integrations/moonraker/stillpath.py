@@ -65,6 +65,11 @@ class Stillpath:
     def __init__(self, config: Any) -> None:
         self.server = config.get_server()
         self._files = self.server.lookup_component("file_manager")
+        if not hasattr(self._files.get_metadata_storage(), "register_gcode_processor"):
+            raise config.error(
+                "[stillpath] needs Moonraker 0.10, or one of 2025-02-14 or later, and this one is "
+                "older: update it, or let the slicer call Stillpath (docs/slicer-setup.md)"
+            )
         self._address = config.get("server", "http://127.0.0.1:8000")
         self._machine = config.get("machine")
         self._key = config.load_template("key", "").render()

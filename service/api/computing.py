@@ -31,7 +31,7 @@ from stillpath.service.jobs.problems import problem
 from stillpath.service.jobs.state import Cancelled, Job, JobKind, JobState
 from stillpath.service.security.callers import Caller
 from stillpath.service.storage.base import Storage
-from stillpath.version import __version__
+from stillpath.version import build
 
 __all__ = [
     "WAITING",
@@ -112,7 +112,7 @@ class ComputeRequest:
     def job(self, owner: str) -> Job:
         """Return the job that answers it."""
         hashes = [sha256 for _, sha256 in self.files]
-        asked = [self.kind, self.machine, self.revision, self.options, hashes, __version__]
+        asked = [self.kind, self.machine, self.revision, self.options, hashes, build()]
         digest = hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()
         return Job(
             id=uuid.uuid4().hex,

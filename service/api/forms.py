@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import AsyncIterable, Awaitable, Callable
 from typing import TYPE_CHECKING
+from urllib.parse import unquote_to_bytes
 
 from fastapi import Request
 from python_multipart.exceptions import FormParserError
@@ -18,6 +20,10 @@ __all__ = ["broken_form", "is_form", "read_form"]
 
 _MOST_FIELDS = 32
 _LONGEST_FIELD_BYTES = 4096
+
+# .NET (PowerShell) and older urllib3 write names beyond ASCII so, and without it nothing that can
+# be used; RFC 7578, 4.2, does not want it, and the parser leaves it out.
+_EXTENDED_NAME = re.compile(rb";[ \t]*filename\*[ \t]*=[ \t]*utf-8'[^']*'([^;\s]+)", re.IGNORECASE)
 
 Take = Callable[[bytes], None]
 
@@ -113,8 +119,12 @@ class _Form:
         self._field = self._value = b""
 
     def _headers_finished(self) -> None:
-        _, parameters = parse_options_header(self._headers.get(b"content-disposition"))
+        disposition = self._headers.get(b"content-disposition", b"")
+        _, parameters = parse_options_header(disposition)
         name = parameters.get(b"filename")
+        extended = _EXTENDED_NAME.search(disposition)
+        if extended is not None:
+            name = unquote_to_bytes(extended[1])
         if name is not None:
             self._take = self._begin(name.decode("utf-8", "replace"))
         elif len(self.fields) < _MOST_FIELDS:

@@ -15,7 +15,7 @@ from stillpath.service.database.engine import StoreError
 from stillpath.service.jobs.store import JobStore
 from stillpath.service.storage.base import Storage, StorageError
 from stillpath.service.storage.disk import Disk
-from stillpath.version import __version__
+from stillpath.version import __version__, build
 
 __all__ = ["Readiness", "router"]
 
@@ -27,7 +27,7 @@ router = APIRouter(tags=["health"])
 @router.get("/healthz", summary="Liveness probe")
 async def healthz() -> Health:
     """Return `ok` while the process runs."""
-    return Health(status="ok", version=__version__)
+    return Health(status="ok", version=__version__, build=build())
 
 
 @router.get("/readyz", responses=responses(503), summary="Readiness probe")
@@ -40,7 +40,7 @@ async def readyz(request: Request) -> Health:
     part = await request.app.state.readiness.missing(request)
     if part is not None:
         raise Problem(503, "Not ready", not_ready(part), part=part)
-    return Health(status="ok", version=__version__)
+    return Health(status="ok", version=__version__, build=build())
 
 
 class Readiness:

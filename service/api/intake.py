@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import shutil
 import time
 import uuid
@@ -41,13 +42,15 @@ from stillpath.service.security.callers import Caller
 from stillpath.service.settings import Settings
 from stillpath.service.storage.base import Storage, StorageError
 from stillpath.service.storage.disk import Disk
-from stillpath.version import __version__
+from stillpath.version import build
 
 __all__ = ["Intake", "Taken"]
 
 _STORED_AT_ONCE = 12
 """Uploads that are stored in parallel: this may take minutes, and threads are shared by all
 requests."""
+
+_PLATE = re.compile(r"[1-9][0-9]{0,3}")
 
 _ASKED_AT_ONCE = 8
 """Printers that are queried in parallel before uploads."""
@@ -106,6 +109,7 @@ class Intake:
         self.folder = settings.data_dir / "incoming"
         self._turns = CapacityLimiter(_STORED_AT_ONCE)
         self._printers_asked = CapacityLimiter(_ASKED_AT_ONCE)
+        build()  # of the code that runs, not of what an update puts in its place
 
     def prepare(self) -> None:
         """Make the folder of uploads on their way, and delete what a killed service left there."""
@@ -131,7 +135,7 @@ class Intake:
         Parameters
         ----------
         wanted : JobQuery
-            `print` may also come as a form field, as with OctoPrint.
+            `print` and the plate may also come as form fields, as with OctoPrint.
 
         Raises
         ------
@@ -318,7 +322,8 @@ class Intake:
             raise Problem(
                 422,
                 "Printer required",
-                "`print` needs a printer: name one of /v1/printers as well.",
+                "`print` needs a printer: name one of /v1/printers as well (in a slicer by its "
+                "address), or upload without printing.",
             )
 
     def _earlier(self, caller: Caller, key: str, fingerprint: str) -> Job | None:
@@ -374,9 +379,10 @@ class Intake:
 
 
 def _with_fields(wanted: JobQuery, upload: Upload) -> JobQuery:
-    """Take `print` from the form, as printers' own APIs do.
+    """Take `print` and the plate from the form, as printers' own APIs do.
 
-    Other parameters in the form are refused: they would be ignored without a word.
+    OrcaSlicer names the plate of a package, from 1 (src/slic3r/Utils/OctoPrint.cpp, 2026); other
+    files have none. Other parameters are refused: they would be ignored without a word.
     """
     misplaced = sorted((upload.fields.keys() & JobQuery.model_fields.keys()) - {"print"})
     if misplaced:
@@ -386,9 +392,13 @@ def _with_fields(wanted: JobQuery, upload: Upload) -> JobQuery:
             f"{', '.join(misplaced)}: parameters belong in the address (?{misplaced[0]}=...), and "
             "the form holds the file alone.",
         )
+    taken: dict[str, Any] = {}
     if upload.fields.get("print", "").strip().lower() in ("true", "1", "yes", "on"):
-        return wanted.model_copy(update={"print": True})
-    return wanted
+        taken["print"] = True
+    plate = upload.fields.get("plateindex", "").strip()
+    if wanted.plate is None and _PLATE.fullmatch(plate) and upload.name.lower().endswith(".3mf"):
+        taken["plate"] = int(plate)
+    return wanted.model_copy(update=taken) if taken else wanted
 
 
 def _dedupe_key(wanted: JobQuery, upload: Upload, pinned: PinnedMachine) -> str:
@@ -399,7 +409,7 @@ def _dedupe_key(wanted: JobQuery, upload: Upload, pinned: PinnedMachine) -> str:
         pinned.machine.revision,
         wanted.options(),
         wanted.batch,  # a list of a batch must be whole
-        __version__,
+        build(),
     )
 
 

@@ -108,6 +108,15 @@ async def version_of(request: Request, name: PrinterName, _: Reader) -> ApiVersi
     return ApiVersion()
 
 
+@router.get("/printers/{name}", include_in_schema=False)
+@router.get("/printers/{name}/", include_in_schema=False)
+async def page_of(request: Request, name: PrinterName) -> Response:  # noqa: ARG001
+    """Lead to the page: OrcaSlicer shows what is at the address that it sends files to."""
+    # From here, because a proxy may have the service below a path.
+    up = "../../" if request.url.path.endswith("/") else "../"
+    return Response(status_code=307, headers={"Location": up})
+
+
 _UPLOAD: dict[str, Any] = {
     "status_code": 201,
     "openapi_extra": upload_body(required_form=True),

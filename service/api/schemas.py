@@ -260,10 +260,15 @@ class LayerIndex(BaseModel):
 class Health(BaseModel):
     """Answer of the health checks."""
 
-    model_config = ConfigDict(json_schema_extra={"examples": [{"status": "ok", "version": "0.7"}]})
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [{"status": "ok", "version": "0.7.0", "build": "0.7.0+5f2c8e0e1a2b"}]
+        }
+    )
 
     status: str
     version: str
+    build: Annotated[str, Field(description="Version, and a digest of the code that computes.")]
 
 
 def _stage(job: Job) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
+import unicodedata
 from collections.abc import AsyncGenerator, Callable, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
@@ -177,7 +178,7 @@ async def receive_document(request: Request, *, max_bytes: int) -> bytes:
 
 def safe_name(name: str) -> str:
     """Return a file name without folders, control characters or surprises."""
-    base = re.split(r"[/\\]", name)[-1]
+    base = re.split(r"[/\\]", unicodedata.normalize("NFC", name))[-1]  # macOS takes letters apart
     base = re.sub(r"[^\w .()+-]", "_", base).strip(" .")
     # File systems count bytes; printers tell the kind of a file by its suffix.
     suffix = _SUFFIX.search(base)

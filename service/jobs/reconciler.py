@@ -165,8 +165,11 @@ class Reconciler:
             if self._stopping.is_set():
                 return  # connecting may take long; do not start workers during a shutdown
         self.slots = self._cluster.slots()
-        self._set_trouble(None if self.slots else "no worker is connected to the scheduler")
+        if not self.slots:
+            self._set_trouble("no worker is connected to the scheduler")
         self._renew()
+        if self.slots:  # and the database takes writes
+            self._set_trouble(None)
         if not self._has_lease:
             self._free = 0
             self._forget()  # the holder of the lease submits them again

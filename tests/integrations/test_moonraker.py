@@ -424,6 +424,12 @@ def test_a_component_without_its_repository(tmp_path: Path):
         with_component(tmp_path, lambda *_: None, script=str(tmp_path / "nowhere.py"))
 
 
+def test_a_moonraker_that_is_too_old_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(Server, "get_metadata_storage", lambda _: object())
+    with pytest.raises(ServerError, match=r"needs Moonraker 0\.10.*update"):
+        component_module().load_component(Config(Server(tmp_path), {"machine": "ender3"}))
+
+
 def test_the_macros():
     called: list[tuple[str, dict[str, Any]]] = []
     printer = Klipper(macros_of(COMPONENT.with_name("stillpath-moonraker.cfg")))

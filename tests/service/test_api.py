@@ -160,6 +160,24 @@ def test_empty_large_and_broken_uploads_leave_nothing(client: TestClient, data_d
     assert sorted((data_dir / "jobs").glob("*")) == before
 
 
+@pytest.mark.parametrize(
+    "name",
+    [
+        # .NET
+        "filename=\"=?utf-8?B?Z3LDtg==?=\"; filename*=utf-8''gr%C3%B6%C3%9Fe.gcode",
+        "filename*=UTF-8''gr%C3%B6%C3%9Fe.gcode",  # urllib3 before 1.25
+        "filename*=utf-8''..%2F..%2Fgr%C3%B6%C3%9Fe.gcode",
+    ],
+)
+def test_names_in_forms_may_be_written_as_in_mails(client: TestClient, name: str):
+    disposition = f'Content-Disposition: form-data; name="file"; {name}'
+    form = f"--abc\r\n{disposition}\r\n\r\nG1 X31\r\n--abc--\r\n"
+    headers = {"content-type": "multipart/form-data; boundary=abc"}
+    answer = client.post(JOBS, content=form.encode(), headers=headers)
+    assert answer.status_code in (200, 202), answer.text
+    assert answer.json()["source_name"] == "größe.gcode"
+
+
 def test_an_unprintable_file_fails_its_job_with_the_line(client: TestClient):
     where = client.post(JOBS, content=b"bad").headers["location"]
     job = until(client, where, over)
@@ -243,6 +261,7 @@ def test_every_route_with_a_name_in_it_may_not_find_it(client: TestClient):
         ("..", "upload.gcode"),
         ("a\x00b\n.gcode", "a_b_.gcode"),
         ("größe.gcode", "größe.gcode"),
+        ("gro\u0308ße.gcode", "größe.gcode"),  # as macOS may write it
         ("x" * 300, "x" * 180),
         ("x" * 300 + ".gcode.3MF", "x" * 170 + ".gcode.3MF"),
         ("\u3042" * 300 + ".bgcode", "\u3042" * 57 + ".bgcode"),

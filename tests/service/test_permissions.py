@@ -56,3 +56,16 @@ def test_a_group_that_was_let_in_stays(tmp_path: Path) -> None:
     assert mode(folder) == 0o750
     private_file(folder / "key")
     assert mode(folder / "key") == 0o600
+
+
+def test_a_database_of_another_user_is_refused_at_the_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As one whose service root has started once: SQLite reads it, and takes no job."""
+    folder = tmp_path / "data"
+    open_database(Settings(data_dir=folder)).dispose()
+    file = folder / "stillpath.sqlite3"
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != file)  # tests may be root's
+    with pytest.raises(PermissionError) as refused:
+        open_database(Settings(data_dir=folder))
+    assert refused.value.filename == str(file)

@@ -1,4 +1,4 @@
-"""Every view for everybody: axe-core in both themes, narrow screens, keys only, themes."""
+"""Every view for everybody: axe-core in both themes, narrow screens, keys only, themes, proxies."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 from axe_playwright_python.sync_playwright import Axe
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Page, Route, expect
 
 from tests.web.machines import put
-from tests.web.served import Service
+from tests.web.served import PART, Service
 from tests.web.visitor import Visitor
 
 PHONE = {"width": 390, "height": 844}
@@ -70,6 +70,26 @@ def test_a_phone_needs_no_sideways_scrolling(
     assert wide <= inner == PHONE["width"]
 
 
+def test_large_letters_need_no_sideways_scrolling(visitor: Visitor, service: Service):
+    large = """addEventListener("DOMContentLoaded", () => {
+        document.documentElement.style.fontSize = "200%";
+    })"""
+    small = {"width": 360, "height": 740}
+    job = service.finished(service.submit(PART, "gear.gcode", compare_live="true"))
+    page = visitor.open("#/", viewport=small, script=large, has_touch=True, is_mobile=True)
+    assert page.evaluate("getComputedStyle(document.body).fontSize") == "32px"
+    for view, there in (
+        ("#/", "form"),
+        ("#/jobs", ".job-row"),
+        ("#/machines", ".cards"),
+        (f"#/jobs/{job['id']}", "text=Filter for Klipper"),
+    ):
+        page.goto(f"{visitor.url}/{view}")
+        page.locator(there).first.wait_for()
+        wide, inner = page.evaluate("[document.documentElement.scrollWidth, innerWidth]")
+        assert wide <= inner == small["width"], view
+
+
 def test_the_theme_follows_the_system_and_the_switch(visitor: Visitor, show: Callable[..., Page]):
     page = show(visitor, "new", color_scheme="dark")
     ground = "getComputedStyle(document.body).backgroundColor"
@@ -123,3 +143,29 @@ def test_everything_can_be_reached_by_keyboard(visitor: Visitor, show: Callable[
     page.get_by_role("link", name="Skip to content").focus()
     page.keyboard.press("Enter")
     assert page.evaluate("document.activeElement.id") == "main"
+
+
+def test_the_page_works_below_a_path_of_a_proxy(
+    visitor: Visitor, service: Service, gear: dict[str, Any]
+):
+    page = visitor.open("#/")
+    below = f"{service.url}/prints"
+
+    def pass_on(route: Route) -> None:
+        url = route.request.url
+        if url.startswith(f"{below}/"):
+            route.fulfill(response=route.fetch(url=url.replace(below, service.url, 1)))
+        else:
+            route.fulfill(status=404, body="another program")
+
+    page.route("**/*", pass_on)
+    page.goto(f"{below}/#/jobs/{gear['id']}")
+    page.locator(".stage[data-renderer]:not([aria-busy])").wait_for()
+    links = page.locator("a[download], a[target=_blank]")
+    for link in links.evaluate_all("links => links.map(a => a.href)"):
+        assert link.startswith(f"{below}/v1/jobs/{gear['id']}/"), link
+    with page.expect_download() as download:
+        page.get_by_role("link", name="G-code").click()
+    assert download.value.url == f"{below}/v1/jobs/{gear['id']}/result"
+    page.goto(f"{below}/#/machines/annex-k3")
+    page.locator(".plot canvas").first.wait_for()

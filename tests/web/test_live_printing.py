@@ -77,7 +77,7 @@ _ENDER3_RUNS_MARLIN = """
 const ask = window.fetch;
 window.fetch = async (address, asking) => {
   const answer = await ask(address, asking);
-  if (!String(address).endsWith("/v1/machines")) return answer;
+  if (!String(address).endsWith("v1/machines")) return answer;
   const machines = await answer.json();
   for (const one of machines) if (one.name === "ender3") one.live_refusal = "it runs marlin";
   return Response.json(machines);

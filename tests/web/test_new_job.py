@@ -506,6 +506,35 @@ def test_a_key_does_where_the_browser_stores_nothing(guarded: Service, visitor: 
     expect(page.get_by_role("dialog")).to_contain_text("asks for a key")
 
 
+def test_only_a_job_that_is_looked_at_holds_a_connection(visitor: Visitor, service: Service):
+    """Browsers have six to a service, for all tabs: the seventh page would not come."""
+    hide = """
+    Object.defineProperty(document, "hidden", { get: () => window.away === true });
+    window.look = (away) => {
+      window.away = away;
+      document.dispatchEvent(new Event("visibilitychange"));
+    };
+    """
+    # The last one waits for the others.
+    jobs = [service.submit(GEAR.read_bytes(), "long.gcode", fresh="true") for _ in range(4)]
+    job = jobs[-1]
+    with service.api.stream("GET", f"/v1/jobs/{job}/events") as events:
+        next(events.iter_raw())  # it is there
+        page = visitor.open("#/jobs", script=hide)
+        visitor.expected.add("ERR_ABORTED")
+        with page.expect_request("**/events"):
+            page.goto(f"{visitor.url}/#/jobs/{job}")
+        with page.expect_event("requestfailed", lambda failed: failed.url.endswith("/events")):
+            page.evaluate("look(true)")
+        with page.expect_response(re.compile(rf"/v1/jobs/{job}$")):
+            pass  # it is asked for now and then
+        with page.expect_request("**/events"):
+            page.evaluate("look(false)")
+    page.close()
+    for job in jobs:
+        service.api.delete(f"/v1/jobs/{job}")
+
+
 def test_a_stream_that_falls_silent_is_left(visitor: Visitor):
     """As on a phone that came into another network: browsers may not notice for minutes."""
     (example,) = JobView.model_config["json_schema_extra"]["examples"]

@@ -149,15 +149,16 @@ class OctoPrintHost(Host):
             "report": entry.id if made.page else "",
             "job": entry.job,
         }
-        for known in (files.get_metadata(_LOCAL, added) or {}).get("links") or []:
-            if known.get("rel") == "web":
-                files.remove_link(_LOCAL, added, "web", {"href": known.get("href")})
+        known = (files.get_metadata(_LOCAL, added) or {}).get("links") or []
+        links = [one for one in known if one.get("rel") != "web"]  # of an earlier result
         note = f"Compensated by Stillpath from {entry.path}: {made.sentence.rstrip('.')}."
         if made.page:
-            files.add_link(_LOCAL, added, "web", {"href": link})
+            links.append({"rel": "web", "href": link})
             note += f" Report: {link}"
         for path, key, value in (
             (added, METADATA, about),
+            # OctoPrint 2.0's add_link does nothing (filemanager/storage/common.py, 2.0.0rc7).
+            (added, "links", links),
             (added, "notes", [{"text": note}]),
             (entry.path, METADATA, {"result": added}),
         ):

@@ -70,14 +70,17 @@ export async function computed(path, asking = {}, onProgress = () => {}) {
 }
 
 /**
- * @param {string} path
+ * Return an address that counts from the page's own: a proxy may have the service below a path.
+ *
+ * @param {string} path As the service knows it, or from here.
  * @param {Record<string, any>} [query]
  * @returns {string}
  */
 export function address(path, query = {}) {
+  const here = path.replace(/^\//, "");
   const given = Object.entries(query).filter(([, v]) => v !== null && v !== undefined && v !== "");
   const text = new URLSearchParams(given.map(([k, v]) => [k, String(v)])).toString();
-  return text ? `${path}?${text}` : path;
+  return text ? `${here}?${text}` : here;
 }
 
 /**

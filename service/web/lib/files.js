@@ -1,6 +1,6 @@
 /** Downloads: plain links, or by way of a blob where a key must go along. */
 
-import { isAbort, request } from "./api.js";
+import { address, isAbort, request } from "./api.js";
 import { h } from "./dom.js";
 import { storedKey } from "./keys.js";
 import { problemPanel } from "./problem.js";
@@ -12,7 +12,8 @@ import { problemPanel } from "./problem.js";
  *   in a tab of its own, where that is possible.
  * @returns {HTMLElement}
  */
-export function fileLink({ text, href, name, main = false, open = false }) {
+export function fileLink({ text, href: path, name, main = false, open = false }) {
+  const href = address(path);
   const style = main ? "a.button.main" : "a.button";
   if (storedKey() === null) {
     return h(style, open ? { href, target: "_blank", rel: "noopener" } : { href, download: name },

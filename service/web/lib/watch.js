@@ -1,4 +1,9 @@
-/** Follows a job: by the service's stream of events, or by asking while there is none. */
+/**
+ * Follows a job: by the service's stream of events, or by asking while there is none.
+ *
+ * Browsers have six connections to a service, over all tabs, and a stream holds one. So there is one
+ * only while its tab is looked at: the seventh tab would wait for as long as the jobs of the others.
+ */
 
 import { getJson, request } from "./api.js";
 import { ProblemError } from "./problem.js";
@@ -6,6 +11,7 @@ import { ProblemError } from "./problem.js";
 const FINAL = new Set(["done", "failed", "cancelled"]);
 const ASK_EVERY_MS = 1000;
 const SLOWEST_MS = 15_000;
+const HIDDEN_MS = 5000;
 /** The stream says every 15 s that it is there; of a broken connection browsers may not tell for minutes. */
 const QUIET_MS = 45_000;
 
@@ -36,17 +42,27 @@ export async function watchJob(id, onJob, signal, onSilence = () => {}) {
     onJob(job);
   };
   while (!over) {
+    const turned = new AbortController(); // the tab is hidden, or looked at again
+    const turn = () => turned.abort();
+    const here = AbortSignal.any([signal, turned.signal]);
+    document.addEventListener("visibilitychange", turn);
     try {
-      if (streams) await whileHeard(signal, (still, heard) => follow(id, note, still, heard));
-      else note(await getJson(`/v1/jobs/${id}`, { signal }));
+      try {
+        if (streams && !document.hidden) await whileHeard(here, (still, heard) => follow(id, note, still, heard));
+        else note(await getJson(`/v1/jobs/${id}`, { signal }));
+      } catch (error) {
+        if (here.aborted) throw error;
+        if (error instanceof ProblemError && [401, 403, 404].includes(error.status) && !streams) throw error;
+        if (!streams) onSilence();
+        streams = false;
+        wait = Math.min(wait * 1.5, SLOWEST_MS);
+      }
+      if (!over) await pause(document.hidden ? Math.max(wait, HIDDEN_MS) : wait, here);
     } catch (error) {
-      if (signal.aborted) throw error;
-      if (error instanceof ProblemError && [401, 403, 404].includes(error.status) && !streams) throw error;
-      if (!streams) onSilence();
-      streams = false;
-      wait = Math.min(wait * 1.5, SLOWEST_MS);
+      if (signal.aborted || !turned.signal.aborted) throw error;
+    } finally {
+      document.removeEventListener("visibilitychange", turn);
     }
-    if (!over) await pause(wait, signal);
   }
 }
 

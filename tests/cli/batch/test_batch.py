@@ -82,6 +82,14 @@ def test_done_before_is_not_done_again():
     assert states()["a@ender3"] == "done"
 
 
+def test_updated_code_does_everything_again(monkeypatch):
+    fill(a="G28")
+    assert batch() == 0
+    monkeypatch.setattr("stillpath.cli.batch.worker_pool.build", lambda: "0.1.0+0123456789ab")
+    assert batch() == 0
+    assert states() == {"a@ender3": "done"}
+
+
 def test_a_group_of_machines_and_a_map():
     fill(a="G28", petg_b="G28")
     assert batch("--machine", "ender3,voron-v0", "--machine-map", "petg_*=annex-k3") == 0

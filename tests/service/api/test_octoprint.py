@@ -21,6 +21,14 @@ def test_the_test_of_the_connection(client: TestClient):
     assert_problem(client.get("/printers/nope/api/version"), 404, "nope", "left")
 
 
+@pytest.mark.parametrize("where", ["/printers/left", "/printers/ender3/", "/printers/ender3"])
+def test_a_browser_at_the_address_of_a_printer_gets_the_page(client: TestClient, where: str):
+    answer = client.get(where)
+    assert answer.status_code == 200
+    assert answer.url.path == "/"
+    assert "<title>Stillpath</title>" in answer.text
+
+
 @pytest.mark.parametrize("where", ["", "/printers/left"])
 def test_a_file_for_a_printer(client: TestClient, where: str):
     sent = FORM | {"print": (None, "false"), "file": ("gear.gcode", b"G1 X1\n")}
@@ -45,6 +53,26 @@ def test_a_file_for_a_machine(client: TestClient):
     with_print = sent | {"print": (None, "true")}
     refused = client.post("/printers/ender3/api/files/local", files=with_print)
     assert_problem(refused, 422, "printer")
+
+
+@pytest.mark.parametrize(
+    ("name", "index", "plate"),
+    [
+        ("gear.gcode.3mf", "2", 2),
+        ("gear.3MF", "10", 10),
+        ("gear.gcode", "2", None),
+        ("gear.gcode.3mf", "", None),
+        ("gear.gcode.3mf", "0", None),
+        ("gear.gcode.3mf", "the first", None),
+    ],
+)
+def test_the_plate_that_orcaslicer_names(
+    client: TestClient, name: str, index: str, plate: int | None
+):
+    sent = FORM | {"plateindex": (None, index), "file": (name, b"G1 X3\n")}
+    answer = client.post("/printers/ender3/api/files/local", files=sent)
+    job = client.get(answer.json()["job"]).json()
+    assert job["options"]["plate"] == plate
 
 
 def test_what_is_wrong(client: TestClient, tmp_path: Path):

@@ -36,6 +36,21 @@ def test_the_same_file_is_answered_with_the_job_that_is_there(client: TestClient
     assert post(client, b"G1 X12", "&name=a.gcode").status_code == 202
 
 
+def test_updated_code_does_the_same_file_again(client: TestClient, monkeypatch: pytest.MonkeyPatch):
+    """A checkout that is updated has the version that it had."""
+    design = "/v1/machines/ender3/design?axis=x"
+    later = {"Prefer": "respond-async"}
+    first = post(client, b"G1 X14", "&name=a.gcode")
+    asked = client.get(design, headers=later).json()
+    for job in (first.json(), asked):
+        until(client, job["links"]["self"], over)
+    for module in ("intake", "computing"):
+        monkeypatch.setattr(f"stillpath.service.api.{module}.build", lambda: "0.1.0+0123456789ab")
+    again = post(client, b"G1 X14", "&name=a.gcode")
+    assert (again.status_code, again.json()["id"] == first.json()["id"]) == (202, False)
+    assert client.get(design, headers=later).json()["id"] != asked["id"]
+
+
 def test_parameters_in_the_form_are_not_ignored(client: TestClient, data_dir: Path):
     before = folders(data_dir)
     form = {"file": ("a.gcode", b"G1 X13"), "method": (None, "none"), "note": (None, "mine")}

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from stillpath.service.database.engine import DatabaseAway
 from stillpath.service.jobs import reconciler
 from stillpath.service.jobs.reconciler import Reconciler
 from stillpath.service.jobs.state import WAITING_FOR_ROOM, Claimed, Job, JobState, Lost, OutOfRoom
@@ -113,6 +114,35 @@ def test_a_print_is_not_started_days_after_it_was_expected(
     job_id = site.submit("G1", printer="left", print_after=True, created_at=created_at)
     look._tick()
     assert site.get(job_id).print_after == (min(away_h, submitted_h) < 1.0)
+
+
+def test_a_database_that_takes_no_writes_is_trouble_that_lasts(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+):
+    """Workers alone do no jobs: `/readyz` says so once it has lasted."""
+    look = looking(site, Workers())
+    look._tick()
+    assert look._trouble is None
+    look._leased_at -= 3600.0
+    with monkeypatch.context() as broken:
+
+        def lease(*_: object) -> bool:
+            raise DatabaseAway("attempt to write a readonly database")
+
+        broken.setattr(site.store, "lease", lease)
+        broken.setattr(look._stopping, "wait", lambda _: tries.append(look._trouble))
+        broken.setattr(look._stopping, "is_set", lambda: len(tries) == 3)
+        tries: list[str | None] = []
+        begun = time.monotonic()
+        look._run()
+        assert tries == ["attempt to write a readonly database"] * 3
+        assert begun <= look._trouble_since
+        since = look._trouble_since
+        tries.clear()
+        look._run()
+        assert look._trouble_since == since
+    look._tick()
+    assert look._trouble is None
 
 
 def test_jobs_that_wait_for_room_let_others_pass(site: Site):

@@ -80,6 +80,8 @@ HIDDEN = {
     "HEAD /": OPEN,
     "GET /assets/{version}/{path:path}": OPEN,
     "HEAD /assets/{version}/{path:path}": OPEN,
+    "GET /printers/{name}": OPEN,
+    "GET /printers/{name}/": OPEN,
     "GET /openapi.json": OPEN,
     "HEAD /openapi.json": OPEN,
 }
