@@ -17,6 +17,7 @@ from stillpath.models.identification.readers.checks import (
 )
 from stillpath.models.identification.readers.lost_samples import restored
 from stillpath.models.identification.readers.settings import ReadSettings
+from stillpath.models.identification.readers.spikes import sound_samples
 from stillpath.models.identification.readers.tables import MOST_ROWS, Table
 from stillpath.models.identification.types import AccelerationLog
 
@@ -54,7 +55,8 @@ def read_klipper_log(table: Table, axis: str | None, settings: ReadSettings) -> 
     Raises
     ------
     ModelError
-        For a column that is missing or dead, samples lost by the sensor, gaps in time.
+        For a column that is missing or dead, samples lost by the sensor, gaps in time, many
+        garbled samples.
     """
     for comment in table.comments:
         lost = _OVERFLOWS.search(comment)
@@ -65,10 +67,12 @@ def read_klipper_log(table: Table, axis: str | None, settings: ReadSettings) -> 
     bridged = check_steady(values[:, 0], table, _BRIDGED_S)
     time_s, told = restored(values[:, 0])
     accel = values[:, 1:] * _UNITS[settings.acceleration_unit or "mm/s^2"]
+    sound, garbled = sound_samples(time_s, accel, table.source)
+    time_s, accel = time_s[sound], accel[sound]
     columns = dict(zip("xyz", accel.T, strict=True))
     notes = _notes(columns, table, axis, settings)
     return AccelerationLog(
-        time_s, accel, axis, table.source, (*table.notes, *bridged, *told, *notes)
+        time_s, accel, axis, table.source, (*table.notes, *bridged, *told, *garbled, *notes)
     )
 
 
