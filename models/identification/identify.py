@@ -46,6 +46,7 @@ from stillpath.models.identification.messages import (
     phase_fault,
     phase_warning,
     scale_warnings,
+    strength_notes,
     table_mounting_notes,
     unvaried_notes,
 )
@@ -414,6 +415,8 @@ class _AxisWork:
                 # What the reader noticed may be the reason.
                 raise ModelError("; ".join([str(error), *measurement.notes])) from None
             notes = excitation_notes(measurement, self._settings)
+            if self._settings.accel_per_hz_mm_s is None:
+                notes = (*notes, *strength_notes(response, test))
             response = replace(response, notes=(*response.notes, *notes))
             self._aligned.append(aligned)
         elif isinstance(measurement, DrivenLog):

@@ -209,6 +209,31 @@ def test_a_level_that_only_the_fit_shows() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("accel_per_hz_mm_s", "settings", "warned"),
+    [
+        (60.0, {}, True),
+        (75.0, {}, False),
+        (60.0, {"accel_per_hz_mm_s": 60.0}, False),
+    ],
+)
+def test_a_log_without_slow_sweep_may_be_of_klippers_weaker_test(
+    accel_per_hz_mm_s: float, settings: dict[str, float], *, warned: bool
+) -> None:
+    """`sweeping_period: 0` of Klipper since 2024-12; Kalico's test lasts as long."""
+    test = replace(
+        SWEEPING,
+        accel_per_hz_mm_s=accel_per_hz_mm_s,
+        sweeping_accel_mm_s2=0.0,
+        sweeping_period_s=0.0,
+    )
+    file = quick_raw("x", test=test, lead_s=0.0, tail_s=0.0)
+    found = one(file, settings=ReadSettings.model_validate(settings))
+    texts = [text for text in found.warnings if "sweeping_period 0: state yours" in text]
+    assert len(texts) == warned
+    assert main_mode(found) == pytest.approx(42.0, rel=0.005)
+
+
 def test_axes_of_the_sensor_that_seem_exchanged() -> None:
     swapped = Sensor(rate_hz=500.0, rotation=((0, 1, 0), (1, 0, 0), (0, 0, -1)))
     files = [quick_raw(axis, sensor=swapped) for axis in "xy"]
