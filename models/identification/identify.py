@@ -90,7 +90,7 @@ from stillpath.models.identification.types import (
     PlantModel,
     Spectrum,
 )
-from stillpath.models.plants import PlantSetSpec, PlantSpec
+from stillpath.models.plants import ParametricMembers, PlantSetSpec, PlantSpec
 from stillpath.models.provenance import Kind, SourceFile
 
 __all__ = ["Measured", "Progress", "identify"]
@@ -312,7 +312,7 @@ class _AxisWork:
             mounting = [] if self._settings.sensor_axis else mounting_notes(self._axis, chosen)
             notes = [*mounting, *body_notes(self._friction_mm, frame)]
             at = [k for k, (_, c) in enumerate(responses) if c in common]
-            self.late = self._lateness(at, chosen, prompt(nominal))
+            self.late = self._lateness(at, chosen, prompt(nominal), found.plants)
         else:
             warnings = scale_warnings(chosen, nominal)
         found = replace(
@@ -469,16 +469,22 @@ class _AxisWork:
         return replace(better_explained(sliding, stuck), notes=response.notes)
 
     def _lateness(
-        self, numbers: Sequence[int], responses: Sequence[FrequencyResponse], plant: PlantSpec
+        self,
+        numbers: Sequence[int],
+        responses: Sequence[FrequencyResponse],
+        plant: PlantSpec,
+        plants: PlantSetSpec,
     ) -> list[Lateness]:
         """Return how late the axis follows in each log."""
+        members = plants.members
+        others = () if isinstance(members, ParametricMembers) else [m.plant for m in members]
         out = []
         for number, response in zip(numbers, responses, strict=True):
             log = self._used[number].measurement
             assert isinstance(log, AccelerationLog)
             aligned = self._aligned[number]
             started_s = aligned.start_s - self._earlier_s
-            out.append(lateness(log, aligned.excitation, started_s, response, plant))
+            out.append(lateness(log, aligned.excitation, started_s, response, plant, others))
         return out
 
     def _rubbing(self, plants: PlantSetSpec) -> PlantSetSpec:
