@@ -125,7 +125,9 @@ def _notes(
     """Check what the sensor measured."""
     along = sensor_axes(settings.axis or axis, settings.sensor_axis)
     alive = check_alive(columns, table, axis, settings.sensor_axis)
-    return *alive, *check_range(columns, table.source, along)
+    # A sensor may be mounted turned: the column that moved most is what counts.
+    moved = max(columns, key=lambda name: float(np.nan_to_num(np.var(columns[name]))))
+    return *alive, *check_range(columns, table.source, (*along, moved))
 
 
 def _rate_hz(table: Table) -> float:

@@ -314,18 +314,20 @@ def test_a_log_of_m956_without_a_test() -> None:
 
 
 @pytest.mark.slow
-def test_a_sensor_whose_range_ended() -> None:
-    log = quick_log("x")
-    largest = float(np.abs(log.accel_mm_s2[:, 0]).max())
+@pytest.mark.parametrize("column", ["x", "y"])
+def test_a_sensor_whose_range_ended(column: str) -> None:
+    turned = QUICK_SENSOR if column == "x" else replace(QUICK_SENSOR, rotation=TURNED_ROUND_Z)
+    log = quick_log("x", sensor=turned)
+    largest = float(np.abs(log.accel_mm_s2[:, "xyz".index(column)]).max())
 
     def clipped(share: float) -> InputFile:
         accel = np.clip(log.accel_mm_s2, -share * largest, share * largest)
         return raw_file(replace(log, accel_mm_s2=accel))
 
     found = one(clipped(0.9))
-    assert sum("the sensor's x stops at" in w for w in found.warnings) == 1
+    assert sum(f"the sensor's {column} stops at" in w for w in found.warnings) == 1
     # With more of it, damping came out up to three times too large, and friction was blamed.
-    with pytest.raises(ModelError, match=r"csv: the sensor's x stops at .* range ended"):
+    with pytest.raises(ModelError, match=rf"csv: the sensor's {column} stops at .* range ended"):
         one(clipped(0.7))
 
 
