@@ -27,6 +27,8 @@ _LEAST_CORRELATION = 0.6
 _SECOND_PEAK = 0.8
 _APART_S = 2.0  # beyond the side lobes of one peak
 _LEAST_FRACTION = 0.95  # of the sweep, before a cut log is refused
+_LEAST_FIRST_HZ = 0.5  # that of excitations
+_EARLIER_S, _FOLLOWS = 0.5, 0.6  # of a test that began at a lower frequency
 _LATEST_START_S = 0.6  # half a second, plus delays of sensor, plant and time stamps
 _LEAD_S = 0.5
 _UNSURE_S = 0.01  # of a start, where friction and a frame delay slow motion
@@ -131,6 +133,7 @@ def align(
         )
     direction = found.vector / np.linalg.norm(found.vector)
     _check_direction(log, direction, sensor_direction)
+    _check_first_frequency(log, found.excitation, grid_s, accel @ direction, start_s)
     f_reached_hz, notes = _check_ends(log, excitation, profile, grid_s, start_s)
 
     kept = (grid_s >= start_s - _LEAD_S) & (grid_s <= start_s + profile.duration_s)
@@ -332,6 +335,35 @@ def _check_direction(
             f"{log.source}: the sensor moved along {_vector(direction)}, not along "
             f"{_vector(expected)} as its mounting says: another axis was measured, or the sensor "
             "is mounted otherwise; measure the axis again or correct the sensor's axes"
+        )
+
+
+def _check_first_frequency(
+    log: AccelerationLog, excitation: Excitation, grid_s: Array, along: Array, start_s: float
+) -> None:
+    """Refuse a test that began with the log, at a lower frequency than `excitation` says.
+
+    Its pulses are those of `excitation` later on, but at other times within their periods, which
+    looks like friction or damping.
+    """
+    early_s = start_s - float(grid_s[0])
+    first_hz = 0.5 * round(2.0 * (excitation.f_start_hz - excitation.hz_per_s * early_s))
+    if early_s < _EARLIER_S or first_hz < _LEAST_FIRST_HZ:
+        return
+    rate_hz = (len(grid_s) - 1) / float(grid_s[-1] - grid_s[0])
+    profile = regenerate(replace(excitation, f_start_hz=first_hz))
+    before = grid_s < start_s
+    command = profile.cell_averages(grid_s[before] - grid_s[0], 1.0 / rate_hz)
+    size = next_fast_len(len(command), real=True)
+    passed = _band_pass(rfftfreq(size, 1.0 / rate_hz), (0.0, excitation.f_start_hz + 1.0))
+    sent, seen = (rfft(v - np.mean(v), size) * passed for v in (command, along[before]))
+    energy = float(np.sum(np.abs(sent) ** 2) * np.sum(np.abs(seen) ** 2))
+    follows = abs(float(np.real(np.sum(sent.conj() * seen)))) / np.sqrt(energy or 1.0)
+    if follows >= _FOLLOWS:
+        raise ModelError(
+            f"{log.source}: the test began {early_s:.1f} s before it reached "
+            f"{excitation.f_start_hz:g} Hz, at {first_hz:g} Hz: give min_freq = {first_hz:g}, as "
+            "printer.cfg says"
         )
 
 

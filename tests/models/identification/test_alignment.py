@@ -175,6 +175,20 @@ def test_one_axis_measured_twice_is_found_by_the_pair() -> None:
         check_pair(x.direction, swapped.direction)
 
 
+@pytest.mark.parametrize("test", [SHORT, replace(SHORT, sweeping_accel_mm_s2=0.0)])
+@pytest.mark.parametrize("first_hz", [1.0, 3.5])
+def test_a_test_that_began_lower_is_found(test: Excitation, first_hz: float) -> None:
+    """Its pulses come at other times within their periods: friction was blamed for that."""
+    log = log_of(replace(test, f_start_hz=first_hz), lead_s=0.0)
+    with pytest.raises(
+        ModelError, match=rf"began .* before it reached 5 Hz.* min_freq = {first_hz:g}"
+    ):
+        align(log, test)
+    assert align(log, replace(test, f_start_hz=first_hz)).correlation > 0.95
+    # A rest before the test is none.
+    assert align(log_of(test, lead_s=4.0), test).correlation > 0.95
+
+
 def test_wrong_logs_have_their_own_messages() -> None:
     good = log_of()
     rng = np.random.default_rng(13)
