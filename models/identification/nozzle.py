@@ -43,9 +43,9 @@ _LATE_S = 10e-3
 _MODES_START, _BEYOND, _PROMINENCE = 0.06, 1.3, 0.2
 _BELOW = 0.8
 """Highest frequency of a frame, relative to the main mode."""
-_ALONE, _TAKES_PART = 0.6, 0.05
-"""Below this share of the main mode's frequency there is the frame alone: a mode of the axis with
-so large a share would undo the frame."""
+_ALONE, _TAKES_PART = 0.6, 0.25
+"""Below this share of the main mode's frequency there is the frame, and what shakes weakly: a mode
+of the axis with so large a share would undo the frame."""
 _LEAST_MU, _CLEARLY = 0.01, 0.9
 """A frame exists from this mass ratio on, if it brings the residual below the second share."""
 
