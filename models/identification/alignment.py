@@ -18,6 +18,7 @@ from scipy.interpolate import CubicSpline
 from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.excitation import VelocityProfile, klipper_psd, regenerate
+from stillpath.models.identification.strength import strength
 from stillpath.models.identification.types import AccelerationLog, Excitation, Spectrum
 
 __all__ = ["AlignedLog", "align", "check_pair", "resample", "spectrum_along"]
@@ -28,7 +29,7 @@ _SECOND_PEAK = 0.8
 _APART_S = 2.0  # beyond the side lobes of one peak
 _LEAST_FRACTION = 0.95  # of the sweep, before a cut log is refused
 _LEAST_FIRST_HZ = 0.5  # that of excitations
-_EARLIER_S, _FOLLOWS = 0.5, 0.6  # of a test that began at a lower frequency
+_EARLIER_S, _FOLLOWS, _LEAST_LEVEL = 0.5, 0.6, 0.3  # of a test that began at a lower frequency
 _LATEST_START_S = 0.6  # half a second, plus delays of sensor, plant and time stamps
 _LEAD_S = 0.5
 _UNSURE_S = 0.01  # of a start, where friction and a frame delay slow motion
@@ -36,6 +37,7 @@ _TABLE_HZ = 200.0  # where Klipper ends a table
 _CROSS = 0.2  # of the power along the axis
 _AS_LONG_S = 2e-3  # the kinds of a test differ by 11 ms from 10 Hz on, by 21 ms from 5 Hz on
 _PHASES_HZ, _EVERY_HZ, _LATE_S = 16.0, 0.5, 0.02  # where phases are compared, and how
+_AS_STRONG, _STRENGTHS_MM_S = 0.07, 5.0  # the slow sweep tells accel_per_hz within 2 %
 _LEAST_COSINE = 0.7  # 45 degrees: nearer to this axis than to another
 
 
@@ -93,7 +95,11 @@ def spectrum_along(aligned: AlignedLog, log: AccelerationLog, column: str) -> Sp
 
 
 def align(
-    log: AccelerationLog, excitation: Excitation, *, sensor_direction: ArrayLike | None = None
+    log: AccelerationLog,
+    excitation: Excitation,
+    *,
+    sensor_direction: ArrayLike | None = None,
+    is_strength_known: bool = True,
 ) -> AlignedLog:
     """Find the test in the whole of `log`, its start and the sensor's direction.
 
@@ -102,6 +108,9 @@ def align(
 
     Parameters
     ----------
+    is_strength_known : bool
+        Whether accel_per_hz is that of `excitation`; else the log may show another one, if it has
+        the slow square wave.
     sensor_direction : array_like, shape (3,), optional
         Direction of the tested axis in the sensor's axes, if the mounting is known: the log of
         another axis is then refused.
@@ -137,6 +146,12 @@ def align(
     f_reached_hz, notes = _check_ends(log, excitation, profile, grid_s, start_s)
 
     kept = (grid_s >= start_s - _LEAD_S) & (grid_s <= start_s + profile.duration_s)
+    along = np.asarray(accel[kept] @ direction, np.float64)
+    if not is_strength_known and excitation.sweeping_accel_mm_s2 > 0.0:
+        shown = _as_strong(excitation, grid_s[kept] - start_s, command[kept], along, rate_hz)
+        if shown is not excitation:
+            again = align(log, shown, sensor_direction=sensor_direction)
+            return replace(again, notes=(*again.notes, _strength_note(excitation, shown)))
     coupling = _coupling(log, accel[kept], direction, rate_hz, excitation)
     # Klipper begins a log with the first move; before, the machine stood still.
     lead_s = float(grid_s[0]) - (start_s - _LEAD_S)
@@ -144,7 +159,7 @@ def align(
     return AlignedLog(
         rate_hz,
         np.pad(command[kept], (rest, 0)),
-        np.pad(np.asarray(accel[kept] @ direction, np.float64), (rest, 0)),
+        np.pad(along, (rest, 0)),
         start_s,
         f_reached_hz,
         direction,
@@ -338,6 +353,29 @@ def _check_direction(
         )
 
 
+def _as_strong(
+    excitation: Excitation, since_s: Array, command: Array, along: Array, rate_hz: float
+) -> Excitation:
+    """Return the test with accel_per_hz as a log shows it; the same one if that is so."""
+    alone = regenerate(replace(excitation, sweeping_accel_mm_s2=0.0))
+    pulses = alone.cell_averages(since_s, 1.0 / rate_hz)
+    ratio = strength(command - pulses, pulses, along, rate_hz, excitation.f_start_hz)
+    if abs(np.log(ratio)) <= _AS_STRONG:
+        return excitation
+    # Repeats must be of one strength, and most people choose a multiple of five.
+    shown_mm_s = _STRENGTHS_MM_S * max(
+        1.0, round(ratio * excitation.accel_per_hz_mm_s / _STRENGTHS_MM_S)
+    )
+    return replace(excitation, accel_per_hz_mm_s=shown_mm_s)
+
+
+def _strength_note(assumed: Excitation, shown: Excitation) -> str:
+    return (
+        f"accel_per_hz {shown.accel_per_hz_mm_s:g} instead, as the log shows beside its slow sweep "
+        f"of {assumed.sweeping_accel_mm_s2:g} mm/s^2"
+    )
+
+
 def _check_first_frequency(
     log: AccelerationLog, excitation: Excitation, grid_s: Array, along: Array, start_s: float
 ) -> None:
@@ -357,9 +395,11 @@ def _check_first_frequency(
     size = next_fast_len(len(command), real=True)
     passed = _band_pass(rfftfreq(size, 1.0 / rate_hz), (0.0, excitation.f_start_hz + 1.0))
     sent, seen = (rfft(v - np.mean(v), size) * passed for v in (command, along[before]))
-    energy = float(np.sum(np.abs(sent) ** 2) * np.sum(np.abs(seen) ** 2))
-    follows = abs(float(np.real(np.sum(sent.conj() * seen)))) / np.sqrt(energy or 1.0)
-    if follows >= _FOLLOWS:
+    both = abs(float(np.real(np.sum(sent.conj() * seen))))
+    sent_all, seen_all = (float(np.linalg.norm(v)) for v in (sent, seen))
+    # The noise of a rest follows anything, but is weak.
+    follows = both >= _FOLLOWS * sent_all * seen_all and both >= _LEAST_LEVEL * sent_all**2
+    if follows:
         raise ModelError(
             f"{log.source}: the test began {early_s:.1f} s before it reached "
             f"{excitation.f_start_hz:g} Hz, at {first_hz:g} Hz: give min_freq = {first_hz:g}, as "

@@ -364,7 +364,7 @@ class _AxisWork:
         self._spectra = [
             (
                 spectrum_along(aligned, log, column),
-                excitation_for(log, self._settings),
+                self._test(log, aligned),
                 one.condition,
             )
             for aligned, one in zip(self._aligned, self._used, strict=True)
@@ -380,6 +380,10 @@ class _AxisWork:
             notes=(*found.notes, *body_notes(self._friction_mm, None), *left_out),
             warnings=(*found.warnings, phase_warning(self._axis, fault, read)),
         )
+
+    def _test(self, log: AccelerationLog, aligned: AlignedLog) -> Excitation:
+        test = excitation_for(log, self._settings)
+        return replace(test, accel_per_hz_mm_s=aligned.excitation.accel_per_hz_mm_s)
 
     def _explained(self) -> Explanations:
         """Return what explains the spectra without a condition of their own."""
@@ -402,7 +406,11 @@ class _AxisWork:
             sensor = self._settings.sensor_axis
             mounted = None if sensor is None else _SENSOR_AXES[sensor]
             try:
-                aligned = align(measurement, test, sensor_direction=mounted)
+                known = self._settings.accel_per_hz_mm_s is not None
+                aligned = align(
+                    measurement, test, sensor_direction=mounted, is_strength_known=known
+                )
+                test = aligned.excitation
                 response = estimate_response(
                     measurement,
                     test,
@@ -415,7 +423,7 @@ class _AxisWork:
                 # What the reader noticed may be the reason.
                 raise ModelError("; ".join([str(error), *measurement.notes])) from None
             notes = excitation_notes(measurement, self._settings)
-            if self._settings.accel_per_hz_mm_s is None:
+            if not known:
                 notes = (*notes, *strength_notes(response, test))
             response = replace(response, notes=(*response.notes, *notes))
             self._aligned.append(aligned)
