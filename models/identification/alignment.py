@@ -123,23 +123,10 @@ def align(
         is there twice, lacks its start or its end, or if the axis is not the one that was asked
         for.
     """
-    _check_axis(log, excitation)
     grid_s, accel = resample(log)
     rate_hz = (len(grid_s) - 1) / float(grid_s[-1] - grid_s[0])
-    low_hz = 1.2 * excitation.f_start_hz
-    band_hz = (low_hz, min(low_hz + _BAND_HZ, excitation.f_end_hz))
-    _check_length(log, grid_s, excitation, band_hz[1])
-    kinds = [_place(kind, grid_s, accel, band_hz) for kind in _kinds(excitation)]
-    likely = _as_long(kinds, grid_s) or kinds
-    found = max(likely, key=lambda placed: _agreement(placed, accel, rate_hz, low_hz))
+    found = _find(log, excitation, grid_s, accel)
     profile, start_s, command = found.profile, found.start_s, found.command
-    if found.correlation < _LEAST_CORRELATION:
-        raise ModelError(_not_found(log, excitation, accel, found.correlation))
-    if found.other_s is not None:
-        raise ModelError(
-            f"{log.source}: the log holds more than one test: it fits at {start_s:.1f} s and as "
-            f"well at {found.other_s:.1f} s; give a log of one test"
-        )
     direction = found.vector / np.linalg.norm(found.vector)
     _check_direction(log, direction, sensor_direction)
     _check_first_frequency(log, found.excitation, grid_s, accel @ direction, start_s)
@@ -218,6 +205,26 @@ def _kinds(excitation: Excitation) -> tuple[Excitation, ...]:
     if excitation.sweeping_accel_mm_s2 > 0.0 and excitation.sweeping_period_s > 0.0:
         return (excitation,)
     return tuple(replace(excitation, out_and_back=old) for old in (False, True))
+
+
+def _find(log: AccelerationLog, excitation: Excitation, grid_s: Array, accel: Array) -> _Placed:
+    """Return the test where it fits a log best, of the kind that fits best."""
+    _check_axis(log, excitation)
+    rate_hz = (len(grid_s) - 1) / float(grid_s[-1] - grid_s[0])
+    low_hz = 1.2 * excitation.f_start_hz
+    band_hz = (low_hz, min(low_hz + _BAND_HZ, excitation.f_end_hz))
+    _check_length(log, grid_s, excitation, band_hz[1])
+    kinds = [_place(kind, grid_s, accel, band_hz) for kind in _kinds(excitation)]
+    likely = _as_long(kinds, grid_s) or kinds
+    found = max(likely, key=lambda placed: _agreement(placed, accel, rate_hz, low_hz))
+    if found.correlation < _LEAST_CORRELATION:
+        raise ModelError(_not_found(log, excitation, accel, found.correlation))
+    if found.other_s is not None:
+        raise ModelError(
+            f"{log.source}: the log holds more than one test: it fits at {found.start_s:.1f} s "
+            f"and as well at {found.other_s:.1f} s; give a log of one test"
+        )
+    return found
 
 
 def _place(
