@@ -18,6 +18,7 @@ from scipy.interpolate import CubicSpline
 from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.excitation import VelocityProfile, klipper_psd, regenerate
+from stillpath.models.identification.strength import strength
 from stillpath.models.identification.types import AccelerationLog, Excitation, Spectrum
 
 __all__ = ["AlignedLog", "align", "check_pair", "resample", "spectrum_along"]
@@ -27,6 +28,8 @@ _LEAST_CORRELATION = 0.6
 _SECOND_PEAK = 0.8
 _APART_S = 2.0  # beyond the side lobes of one peak
 _LEAST_FRACTION = 0.95  # of the sweep, before a cut log is refused
+_LEAST_FIRST_HZ = 0.5  # that of excitations
+_EARLIER_S, _FOLLOWS, _LEAST_LEVEL = 0.5, 0.6, 0.3  # of a test that began at a lower frequency
 _LATEST_START_S = 0.6  # half a second, plus delays of sensor, plant and time stamps
 _LEAD_S = 0.5
 _UNSURE_S = 0.01  # of a start, where friction and a frame delay slow motion
@@ -34,6 +37,7 @@ _TABLE_HZ = 200.0  # where Klipper ends a table
 _CROSS = 0.2  # of the power along the axis
 _AS_LONG_S = 2e-3  # the kinds of a test differ by 11 ms from 10 Hz on, by 21 ms from 5 Hz on
 _PHASES_HZ, _EVERY_HZ, _LATE_S = 16.0, 0.5, 0.02  # where phases are compared, and how
+_AS_STRONG, _STRENGTHS_MM_S = 0.07, 5.0  # the slow sweep tells accel_per_hz within 2 %
 _LEAST_COSINE = 0.7  # 45 degrees: nearer to this axis than to another
 
 
@@ -91,7 +95,11 @@ def spectrum_along(aligned: AlignedLog, log: AccelerationLog, column: str) -> Sp
 
 
 def align(
-    log: AccelerationLog, excitation: Excitation, *, sensor_direction: ArrayLike | None = None
+    log: AccelerationLog,
+    excitation: Excitation,
+    *,
+    sensor_direction: ArrayLike | None = None,
+    is_strength_known: bool = True,
 ) -> AlignedLog:
     """Find the test in the whole of `log`, its start and the sensor's direction.
 
@@ -100,6 +108,9 @@ def align(
 
     Parameters
     ----------
+    is_strength_known : bool
+        Whether accel_per_hz is that of `excitation`; else the log may show another one, if it has
+        the slow square wave.
     sensor_direction : array_like, shape (3,), optional
         Direction of the tested axis in the sensor's axes, if the mounting is known: the log of
         another axis is then refused.
@@ -112,28 +123,22 @@ def align(
         is there twice, lacks its start or its end, or if the axis is not the one that was asked
         for.
     """
-    _check_axis(log, excitation)
     grid_s, accel = resample(log)
     rate_hz = (len(grid_s) - 1) / float(grid_s[-1] - grid_s[0])
-    low_hz = 1.2 * excitation.f_start_hz
-    band_hz = (low_hz, min(low_hz + _BAND_HZ, excitation.f_end_hz))
-    _check_length(log, grid_s, excitation, band_hz[1])
-    kinds = [_place(kind, grid_s, accel, band_hz) for kind in _kinds(excitation)]
-    likely = _as_long(kinds, grid_s) or kinds
-    found = max(likely, key=lambda placed: _agreement(placed, accel, rate_hz, low_hz))
+    found = _find(log, excitation, grid_s, accel)
     profile, start_s, command = found.profile, found.start_s, found.command
-    if found.correlation < _LEAST_CORRELATION:
-        raise ModelError(_not_found(log, excitation, accel, found.correlation))
-    if found.other_s is not None:
-        raise ModelError(
-            f"{log.source}: the log holds more than one test: it fits at {start_s:.1f} s and as "
-            f"well at {found.other_s:.1f} s; give a log of one test"
-        )
     direction = found.vector / np.linalg.norm(found.vector)
     _check_direction(log, direction, sensor_direction)
+    _check_first_frequency(log, found.excitation, grid_s, accel @ direction, start_s)
     f_reached_hz, notes = _check_ends(log, excitation, profile, grid_s, start_s)
 
     kept = (grid_s >= start_s - _LEAD_S) & (grid_s <= start_s + profile.duration_s)
+    along = np.asarray(accel[kept] @ direction, np.float64)
+    if not is_strength_known and excitation.sweeping_accel_mm_s2 > 0.0:
+        shown = _as_strong(excitation, grid_s[kept] - start_s, command[kept], along, rate_hz)
+        if shown is not excitation:
+            again = align(log, shown, sensor_direction=sensor_direction)
+            return replace(again, notes=(*again.notes, _strength_note(excitation, shown)))
     coupling = _coupling(log, accel[kept], direction, rate_hz, excitation)
     # Klipper begins a log with the first move; before, the machine stood still.
     lead_s = float(grid_s[0]) - (start_s - _LEAD_S)
@@ -141,7 +146,7 @@ def align(
     return AlignedLog(
         rate_hz,
         np.pad(command[kept], (rest, 0)),
-        np.pad(np.asarray(accel[kept] @ direction, np.float64), (rest, 0)),
+        np.pad(along, (rest, 0)),
         start_s,
         f_reached_hz,
         direction,
@@ -200,6 +205,26 @@ def _kinds(excitation: Excitation) -> tuple[Excitation, ...]:
     if excitation.sweeping_accel_mm_s2 > 0.0 and excitation.sweeping_period_s > 0.0:
         return (excitation,)
     return tuple(replace(excitation, out_and_back=old) for old in (False, True))
+
+
+def _find(log: AccelerationLog, excitation: Excitation, grid_s: Array, accel: Array) -> _Placed:
+    """Return the test where it fits a log best, of the kind that fits best."""
+    _check_axis(log, excitation)
+    rate_hz = (len(grid_s) - 1) / float(grid_s[-1] - grid_s[0])
+    low_hz = 1.2 * excitation.f_start_hz
+    band_hz = (low_hz, min(low_hz + _BAND_HZ, excitation.f_end_hz))
+    _check_length(log, grid_s, excitation, band_hz[1])
+    kinds = [_place(kind, grid_s, accel, band_hz) for kind in _kinds(excitation)]
+    likely = _as_long(kinds, grid_s) or kinds
+    found = max(likely, key=lambda placed: _agreement(placed, accel, rate_hz, low_hz))
+    if found.correlation < _LEAST_CORRELATION:
+        raise ModelError(_not_found(log, excitation, accel, found.correlation))
+    if found.other_s is not None:
+        raise ModelError(
+            f"{log.source}: the log holds more than one test: it fits at {found.start_s:.1f} s "
+            f"and as well at {found.other_s:.1f} s; give a log of one test"
+        )
+    return found
 
 
 def _place(
@@ -332,6 +357,60 @@ def _check_direction(
             f"{log.source}: the sensor moved along {_vector(direction)}, not along "
             f"{_vector(expected)} as its mounting says: another axis was measured, or the sensor "
             "is mounted otherwise; measure the axis again or correct the sensor's axes"
+        )
+
+
+def _as_strong(
+    excitation: Excitation, since_s: Array, command: Array, along: Array, rate_hz: float
+) -> Excitation:
+    """Return the test with accel_per_hz as a log shows it; the same one if that is so."""
+    alone = regenerate(replace(excitation, sweeping_accel_mm_s2=0.0))
+    pulses = alone.cell_averages(since_s, 1.0 / rate_hz)
+    ratio = strength(command - pulses, pulses, along, rate_hz, excitation.f_start_hz)
+    if abs(np.log(ratio)) <= _AS_STRONG:
+        return excitation
+    # Repeats must be of one strength, and most people choose a multiple of five.
+    shown_mm_s = _STRENGTHS_MM_S * max(
+        1.0, round(ratio * excitation.accel_per_hz_mm_s / _STRENGTHS_MM_S)
+    )
+    return replace(excitation, accel_per_hz_mm_s=shown_mm_s)
+
+
+def _strength_note(assumed: Excitation, shown: Excitation) -> str:
+    return (
+        f"accel_per_hz {shown.accel_per_hz_mm_s:g} instead, as the log shows beside its slow sweep "
+        f"of {assumed.sweeping_accel_mm_s2:g} mm/s^2"
+    )
+
+
+def _check_first_frequency(
+    log: AccelerationLog, excitation: Excitation, grid_s: Array, along: Array, start_s: float
+) -> None:
+    """Refuse a test that began with the log, at a lower frequency than `excitation` says.
+
+    Its pulses are those of `excitation` later on, but at other times within their periods, which
+    looks like friction or damping.
+    """
+    early_s = start_s - float(grid_s[0])
+    first_hz = 0.5 * round(2.0 * (excitation.f_start_hz - excitation.hz_per_s * early_s))
+    if early_s < _EARLIER_S or first_hz < _LEAST_FIRST_HZ:
+        return
+    rate_hz = (len(grid_s) - 1) / float(grid_s[-1] - grid_s[0])
+    profile = regenerate(replace(excitation, f_start_hz=first_hz))
+    before = grid_s < start_s
+    command = profile.cell_averages(grid_s[before] - grid_s[0], 1.0 / rate_hz)
+    size = next_fast_len(len(command), real=True)
+    passed = _band_pass(rfftfreq(size, 1.0 / rate_hz), (0.0, excitation.f_start_hz + 1.0))
+    sent, seen = (rfft(v - np.mean(v), size) * passed for v in (command, along[before]))
+    both = abs(float(np.real(np.sum(sent.conj() * seen))))
+    sent_all, seen_all = (float(np.linalg.norm(v)) for v in (sent, seen))
+    # The noise of a rest follows anything, but is weak.
+    follows = both >= _FOLLOWS * sent_all * seen_all and both >= _LEAST_LEVEL * sent_all**2
+    if follows:
+        raise ModelError(
+            f"{log.source}: the test began {early_s:.1f} s before it reached "
+            f"{excitation.f_start_hz:g} Hz, at {first_hz:g} Hz: give min_freq = {first_hz:g}, as "
+            "printer.cfg says"
         )
 
 

@@ -88,6 +88,8 @@ def dry_friction(
     alone = [_lowest(one[int(np.argmin(one.min(axis=1)))]) for one in rows[motion]]
     clear = left[:, 0].min() - left.min() > _CLEARLY
     agree = max(alone) - min(alone) <= _APART * held_mm
+    # Where the residual still falls at the latest start that was tried, it has no minimum.
+    clear = clear and late < len(_LATE_S) - 1
     return Friction(held_mm, float(_LATE_S[late]), motion) if clear and agree else Friction()
 
 

@@ -46,6 +46,7 @@ from stillpath.models.identification.messages import (
     phase_fault,
     phase_warning,
     scale_warnings,
+    strength_notes,
     table_mounting_notes,
     unvaried_notes,
 )
@@ -89,7 +90,7 @@ from stillpath.models.identification.types import (
     PlantModel,
     Spectrum,
 )
-from stillpath.models.plants import PlantSetSpec, PlantSpec
+from stillpath.models.plants import ParametricMembers, PlantSetSpec, PlantSpec
 from stillpath.models.provenance import Kind, SourceFile
 
 __all__ = ["Measured", "Progress", "identify"]
@@ -311,7 +312,7 @@ class _AxisWork:
             mounting = [] if self._settings.sensor_axis else mounting_notes(self._axis, chosen)
             notes = [*mounting, *body_notes(self._friction_mm, frame)]
             at = [k for k, (_, c) in enumerate(responses) if c in common]
-            self.late = self._lateness(at, chosen, prompt(nominal))
+            self.late = self._lateness(at, chosen, prompt(nominal), found.plants)
         else:
             warnings = scale_warnings(chosen, nominal)
         found = replace(
@@ -363,7 +364,7 @@ class _AxisWork:
         self._spectra = [
             (
                 spectrum_along(aligned, log, column),
-                excitation_for(log, self._settings),
+                self._test(log, aligned),
                 one.condition,
             )
             for aligned, one in zip(self._aligned, self._used, strict=True)
@@ -379,6 +380,10 @@ class _AxisWork:
             notes=(*found.notes, *body_notes(self._friction_mm, None), *left_out),
             warnings=(*found.warnings, phase_warning(self._axis, fault, read)),
         )
+
+    def _test(self, log: AccelerationLog, aligned: AlignedLog) -> Excitation:
+        test = excitation_for(log, self._settings)
+        return replace(test, accel_per_hz_mm_s=aligned.excitation.accel_per_hz_mm_s)
 
     def _explained(self) -> Explanations:
         """Return what explains the spectra without a condition of their own."""
@@ -401,7 +406,11 @@ class _AxisWork:
             sensor = self._settings.sensor_axis
             mounted = None if sensor is None else _SENSOR_AXES[sensor]
             try:
-                aligned = align(measurement, test, sensor_direction=mounted)
+                known = self._settings.accel_per_hz_mm_s is not None
+                aligned = align(
+                    measurement, test, sensor_direction=mounted, is_strength_known=known
+                )
+                test = aligned.excitation
                 response = estimate_response(
                     measurement,
                     test,
@@ -414,6 +423,8 @@ class _AxisWork:
                 # What the reader noticed may be the reason.
                 raise ModelError("; ".join([str(error), *measurement.notes])) from None
             notes = excitation_notes(measurement, self._settings)
+            if not known:
+                notes = (*notes, *strength_notes(response, test))
             response = replace(response, notes=(*response.notes, *notes))
             self._aligned.append(aligned)
         elif isinstance(measurement, DrivenLog):
@@ -466,16 +477,22 @@ class _AxisWork:
         return replace(better_explained(sliding, stuck), notes=response.notes)
 
     def _lateness(
-        self, numbers: Sequence[int], responses: Sequence[FrequencyResponse], plant: PlantSpec
+        self,
+        numbers: Sequence[int],
+        responses: Sequence[FrequencyResponse],
+        plant: PlantSpec,
+        plants: PlantSetSpec,
     ) -> list[Lateness]:
         """Return how late the axis follows in each log."""
+        members = plants.members
+        others = () if isinstance(members, ParametricMembers) else [m.plant for m in members]
         out = []
         for number, response in zip(numbers, responses, strict=True):
             log = self._used[number].measurement
             assert isinstance(log, AccelerationLog)
             aligned = self._aligned[number]
             started_s = aligned.start_s - self._earlier_s
-            out.append(lateness(log, aligned.excitation, started_s, response, plant))
+            out.append(lateness(log, aligned.excitation, started_s, response, plant, others))
         return out
 
     def _rubbing(self, plants: PlantSetSpec) -> PlantSetSpec:

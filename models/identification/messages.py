@@ -40,6 +40,7 @@ __all__ = [
     "phase_warning",
     "scale_warnings",
     "spectrum_level_warning",
+    "strength_notes",
     "table_mounting_notes",
     "unvaried_notes",
 ]
@@ -53,6 +54,7 @@ _LEVEL_TOLERANCE = 0.15
 _LEVELS = (0.3, 3.0)
 _TABLE_LEVELS = (0.2, 5.0)
 """Of tables, which do not say their accel_per_hz: 12 to 300 where it is not stated."""
+_AS_WEAK = 0.1
 _POOR, _POOR_DB = 0.15, 1.1
 _USELESS, _USELESS_DB = 0.5, 6.0
 """Residuals beyond which a fit is no model of what was measured."""
@@ -255,6 +257,31 @@ def level_warnings(responses: Sequence[FrequencyResponse], fit: Fit) -> list[str
             "measure at the part that the axis moves"
         )
     return [f"{seen}; check accel_per_hz in printer.cfg and the sensor's scale"]
+
+
+def strength_notes(response: FrequencyResponse, test: Excitation) -> tuple[str, ...]:
+    """Return a warning where a log without slow sweep may be of Klipper's weaker test.
+
+    Only its level tells Kalico's test (accel_per_hz 75, resonance_tester.py, 2026-07) from
+    Klipper's with sweeping_period 0 (60).
+
+    Parameters
+    ----------
+    test : Excitation
+        As it was assumed.
+    """
+    gain, usual = plateau_gain(response), Excitation(test.direction)
+    weaker = usual.accel_per_hz_mm_s / test.accel_per_hz_mm_s
+    as_long = test.f_end_hz == usual.f_end_hz and test.sweeping_accel_mm_s2 == 0.0
+    if gain is None or not as_long or not weaker < 1.0 or abs(gain / weaker - 1.0) > _AS_WEAK:
+        return ()
+    text = (
+        f"warning: below 15 Hz the axis moved {gain:.2f} times as much as accel_per_hz = "
+        f"{test.accel_per_hz_mm_s:g} commands, which is Kalico's. Klipper since 2024-12 has "
+        f"{usual.accel_per_hz_mm_s:g}, also with sweeping_period 0: state yours (accel_per_hz). If "
+        "it is right, the axis rubs much, or the sensor's scale is off"
+    )
+    return (text,)
 
 
 def scale_warnings(responses: Sequence[FrequencyResponse], fit: Fit) -> list[str]:

@@ -43,6 +43,9 @@ _LATE_S = 10e-3
 _MODES_START, _BEYOND, _PROMINENCE = 0.06, 1.3, 0.2
 _BELOW = 0.8
 """Highest frequency of a frame, relative to the main mode."""
+_ALONE, _TAKES_PART = 0.6, 0.25
+"""Below this share of the main mode's frequency there is the frame, and what shakes weakly: a mode
+of the axis with so large a share would undo the frame."""
 _LEAST_MU, _CLEARLY = 0.01, 0.9
 """A frame exists from this mass ratio on, if it brings the residual below the second share."""
 
@@ -103,9 +106,12 @@ def frame_of(
     held = _start(data)
     starts = [Frame(f_hz, *_START) for f_hz in _STARTS_HZ] if near is None else [near]
     tried = [_polished(data, held.on_its_feet(frame)) for frame in starts]
-    found = min(tried, key=lambda one: one.cost)
-    frame = found.frame
     main_hz = float(data.f_hz[np.argmax(np.abs(data.response))])
+    possible = [one for one in tried if one.lowest_hz >= _ALONE * main_hz]
+    if not possible:
+        return None
+    found = min(possible, key=lambda one: one.cost)
+    frame = found.frame
     if frame is None or frame.mass_ratio <= _LEAST_MU or frame.f_hz >= _BELOW * main_hz:
         return None
     firm = _polished(data, held)
@@ -127,6 +133,12 @@ class _Found:
             return None
         (f, zeta), mu = np.exp(self.vector[2:4]), self.vector[4]
         return Frame(float(f), float(zeta), float(mu), float(np.exp(self.vector[0])))
+
+    @property
+    def lowest_hz(self) -> float:
+        """Lowest frequency of the axis's modes that take part in the motion."""
+        f, _, share = self.structure.split(self.vector[5 if self.shaken else 2 :])
+        return float(f[np.abs(share) >= _TAKES_PART].min()) * self.structure.unit_hz
 
     def on_its_feet(self, frame: Frame) -> _Found:
         """Return the same with this frame."""

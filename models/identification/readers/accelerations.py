@@ -17,12 +17,17 @@ from stillpath.models.identification.readers.checks import (
 )
 from stillpath.models.identification.readers.lost_samples import restored
 from stillpath.models.identification.readers.settings import ReadSettings
+from stillpath.models.identification.readers.spikes import sound_samples
 from stillpath.models.identification.readers.tables import MOST_ROWS, Table
 from stillpath.models.identification.types import AccelerationLog
 
 __all__ = ["is_klipper_log", "is_m956", "read_klipper_log", "read_m956"]
 
 _UNITS = {"mm/s^2": 1.0, "m/s^2": 1000.0, "g": 9806.65}
+_OWN_UNIT = "mm/s^2"
+_GRAVITY = (0.8, 1.2)
+_LARGEST_G = 40.0
+"""No accelerometer of a printer measures more; a test moves it by more than so many mm/s^2."""
 _LEAST_SAMPLES = 64
 _BRIDGED_S = 0.01
 """A message of the sensor's board, which nobody sends again, has 8 or 10 samples."""
@@ -47,7 +52,7 @@ def is_m956(table: Table) -> bool:
 
 
 def read_klipper_log(table: Table, axis: str | None, settings: ReadSettings) -> AccelerationLog:
-    """Read `#time,accel_x,accel_y,accel_z` in s and mm/s^2.
+    """Read `#time,accel_x,accel_y,accel_z` in s and mm/s^2, or what gravity says to be the unit.
 
     Format: klippy/extras/adxl345.py, 2026-08; newer forks put a line `##` with the sensor's
     statistics before it.
@@ -55,7 +60,8 @@ def read_klipper_log(table: Table, axis: str | None, settings: ReadSettings) -> 
     Raises
     ------
     ModelError
-        For a column that is missing or dead, samples lost by the sensor, gaps in time.
+        For a column that is missing or dead, samples lost by the sensor, gaps in time, many
+        garbled samples.
     """
     for comment in table.comments:
         lost = _OVERFLOWS.search(comment)
@@ -65,12 +71,15 @@ def read_klipper_log(table: Table, axis: str | None, settings: ReadSettings) -> 
     values = table.numbers(("time", *_KLIPPER))
     bridged = check_steady(values[:, 0], table, _BRIDGED_S)
     time_s, told = restored(values[:, 0])
-    accel = values[:, 1:] * _UNITS[settings.acceleration_unit or "mm/s^2"]
+    unit = settings.acceleration_unit or _unit(values[:, 1:])
+    accel = values[:, 1:] * _UNITS[unit]
+    sound, garbled = sound_samples(time_s, accel, table.source)
+    time_s, accel = time_s[sound], accel[sound]
     columns = dict(zip("xyz", accel.T, strict=True))
-    notes = _notes(columns, table, axis, settings)
-    return AccelerationLog(
-        time_s, accel, axis, table.source, (*table.notes, *bridged, *told, *notes)
-    )
+    notes = [*table.notes, *bridged, *told, *garbled, *_notes(columns, table, axis, settings)]
+    if unit != (settings.acceleration_unit or _OWN_UNIT):
+        notes.append(f"gravity in it is that of accelerations in {unit}, so they were taken to be")
+    return AccelerationLog(time_s, accel, axis, table.source, tuple(notes))
 
 
 def read_m956(table: Table, axis: str | None, settings: ReadSettings) -> AccelerationLog:
@@ -100,13 +109,26 @@ def read_m956(table: Table, axis: str | None, settings: ReadSettings) -> Acceler
     return AccelerationLog(values[:, 0] / rate_hz, accel, axis, table.source, (_NO_TEST, *notes))
 
 
+def _unit(values: Array) -> str:
+    """Return the unit of accelerations, shape (n, 3), by the gravity in them."""
+    gravity = float(np.linalg.norm(np.median(values, axis=0)))
+    for unit in ("g", "m/s^2"):
+        one_g = _UNITS["g"] / _UNITS[unit]
+        is_one = _GRAVITY[0] <= gravity / one_g <= _GRAVITY[1]
+        if is_one and float(np.abs(values).max()) <= _LARGEST_G * one_g:
+            return unit
+    return _OWN_UNIT
+
+
 def _notes(
     columns: dict[str, Array], table: Table, axis: str | None, settings: ReadSettings
 ) -> tuple[str, ...]:
     """Check what the sensor measured."""
     along = sensor_axes(settings.axis or axis, settings.sensor_axis)
     alive = check_alive(columns, table, axis, settings.sensor_axis)
-    return *alive, *check_range(columns, table.source, along)
+    # A sensor may be mounted turned: the column that moved most is what counts.
+    moved = max(columns, key=lambda name: float(np.nan_to_num(np.var(columns[name]))))
+    return *alive, *check_range(columns, table.source, (*along, moved))
 
 
 def _rate_hz(table: Table) -> float:

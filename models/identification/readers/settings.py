@@ -60,6 +60,9 @@ _LEAST_SLOW = 0.5
 """The same in a table, where the window leaves 228 mm/s^2 of the slow sweep, 1.5 times the power of
 the test itself from 8 to 15 Hz. Without it up to 92 mm/s^2 and 0.21 times (45 real tables); more of
 a test with a large accel_per_hz."""
+_LONGER_S = (-0.05, 0.5)
+"""By how much a log is longer than its test; Shake&Tune's by some tenths of a second. The default
+test of before 2024-12 lasts 128.3 s, that of since and Kalico's 130 s."""
 _DIAGONAL = re.compile(r"-?\d+(\.\d+)?,-?\d+(\.\d+)?(,-?\d+(\.\d+)?)?")
 _DAY = re.compile(r"\d{4}-\d\d-\d\d")
 _DATE = re.compile(r"(?<!\d)(20\d\d)[-_]?(\d\d)[-_]?(\d\d)(?!\d)")
@@ -273,13 +276,16 @@ def _resolved(measurement: AccelerationLog | Spectrum, settings: ReadSettings) -
                 f"the table reaches {measurement.f_hz[-1]:g} Hz, 1.5 max_freq: so max_freq is "
                 f"{given['f_end_hz']:g}; give it if the table was cut"
             )
+    usual_of_old = _OLD
+    if old and settings.f_end_hz is None and _lasts_as_new(measurement, settings):
+        usual_of_old = _OLD | {"f_end_hz": defaults.f_end_hz}
     values: dict[str, float] = {}
     assumed: list[str] = []
     for name, value in given.items():
         if value is not None:
             values[name] = value
             continue
-        values[name] = _OLD.get(name, getattr(defaults, name)) if old else getattr(defaults, name)
+        values[name] = (usual_of_old if old else {}).get(name, getattr(defaults, name))
         idle = name == "sweeping_period_s" and values["sweeping_accel_mm_s2"] == 0
         if not idle:
             assumed.append(f"{_KLIPPER[name]} {values[name]:g}")
@@ -291,6 +297,8 @@ def _resolved(measurement: AccelerationLog | Spectrum, settings: ReadSettings) -
     excitation = Excitation(defaults.direction, out_and_back=False, **values)
     if assumed:
         era = _era(made, settings, shows=_kind(measurement) if by_file else "")
+        if usual_of_old is not _OLD:
+            era += "; the log is 130 s long, as Kalico's test is to 135 Hz"
         found.append(f"assumed {', '.join(assumed)}: the defaults of Klipper {era}")
     return _Resolved(excitation, tuple(found))
 
@@ -334,6 +342,20 @@ def _contradicts(
         return _table_sweeps(measurement) is _is_old(made)
     period_s = settings.sweeping_period_s or Excitation((1.0, 0.0)).sweeping_period_s
     return _sweeps(measurement, period_s) is _is_old(made)
+
+
+def _lasts_as_new(measurement: AccelerationLog | Spectrum, settings: ReadSettings) -> bool:
+    """Return whether a log is as long as the test of since 2024-12.
+
+    Kalico's has no slow sweep, nor has Klipper's with sweeping_period 0 (printer.cfg).
+    """
+    stated = (settings.f_start_hz, settings.hz_per_s)
+    if isinstance(measurement, Spectrum) or any(one is not None for one in stated):
+        return False
+    usual = Excitation((1.0, 0.0))
+    test_s = (usual.f_end_hz - usual.f_start_hz) / usual.hz_per_s
+    lasted_s = float(measurement.time_s[-1] - measurement.time_s[0])
+    return _LONGER_S[0] <= lasted_s - test_s <= _LONGER_S[1]
 
 
 def _table_sweeps(table: Spectrum) -> bool | None:

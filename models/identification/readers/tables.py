@@ -181,6 +181,9 @@ def as_table(text: str, source: str) -> Table:
     if rows and not _numeric_start(rows[0]):
         header = rows.pop(0)
         lines.pop(0)
+    if rows and '"' in rows[0]:
+        # A spreadsheet may quote every field.
+        rows = [row.replace('"', "") for row in rows]
     delimiter = _delimiter(rows[0] if rows else header)
     if delimiter == "," and "," not in header:
         # Commas within numbers: the header tells what is between them.
@@ -229,7 +232,8 @@ def _names(header: str, delimiter: str | None) -> tuple[str, ...]:
         fields = next(csv.reader([text], delimiter=delimiter))
     except csv.Error:
         fields = text.split(delimiter)
-    return tuple(name.strip().lower() for name in fields)
+    # A spreadsheet may have put the whole name in quotes: "#time".
+    return tuple(name.strip().lstrip("#").lower() for name in fields)
 
 
 def _without_cut_line(table: Table) -> Table:

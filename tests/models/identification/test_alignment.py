@@ -175,6 +175,40 @@ def test_one_axis_measured_twice_is_found_by_the_pair() -> None:
         check_pair(x.direction, swapped.direction)
 
 
+@pytest.mark.parametrize("test", [SHORT, replace(SHORT, sweeping_accel_mm_s2=0.0)])
+@pytest.mark.parametrize("first_hz", [1.0, 3.5])
+def test_a_test_that_began_lower_is_found(test: Excitation, first_hz: float) -> None:
+    """Its pulses come at other times within their periods: friction was blamed for that."""
+    log = log_of(replace(test, f_start_hz=first_hz), lead_s=0.0)
+    with pytest.raises(
+        ModelError, match=rf"began .* before it reached 5 Hz.* min_freq = {first_hz:g}"
+    ):
+        align(log, test)
+    assert align(log, replace(test, f_start_hz=first_hz)).correlation > 0.95
+    # A rest before the test is none.
+    assert align(log_of(test, lead_s=4.0), test).correlation > 0.95
+
+
+@pytest.mark.parametrize("accel_per_hz", [30.0, 50.0, 75.0, 150.0])
+@pytest.mark.parametrize("gain", [0.88, 1.0])
+def test_the_slow_sweep_tells_how_strong_the_pulses_were(accel_per_hz: float, gain: float) -> None:
+    """Whatever the sensor's gain. Taken for 60, pulses of 50 made slow modes and delays of 1 ms."""
+    log = log_of(replace(SHORT, accel_per_hz_mm_s=accel_per_hz), sensor=replace(LIS2DW, gain=gain))
+    shown = align(log, SHORT, is_strength_known=False)
+    assert shown.excitation == replace(SHORT, accel_per_hz_mm_s=accel_per_hz)
+    (note,) = shown.notes
+    assert note.startswith(f"accel_per_hz {accel_per_hz:g} instead, as the log shows beside its")
+    stated = align(log, SHORT)
+    assert (stated.excitation, stated.notes) == (SHORT, ())
+
+
+def test_pulses_as_strong_as_assumed_stay_so() -> None:
+    log = log_of(SHORT, sensor=LIS2DW)
+    shown, stated = align(log, SHORT, is_strength_known=False), align(log, SHORT)
+    assert (shown.excitation, shown.notes) == (SHORT, ())
+    np.testing.assert_array_equal(shown.command_mm_s2, stated.command_mm_s2)
+
+
 def test_wrong_logs_have_their_own_messages() -> None:
     good = log_of()
     rng = np.random.default_rng(13)

@@ -146,6 +146,34 @@ def test_what_the_logs_of_both_axes_agree_on(
     assert [axis for axis, one in found.items() if one.notes] == list(expected_ms)
 
 
+def late_by_plant(*late_ms: float | None) -> Lateness:
+    """Late by .5 ms, and so much against other plants of the set; None: bands differ."""
+    rows = [[0.1, 0.4, 0.8, 1.2] if one is None else 4 * [one] for one in late_ms]
+    return replace(in_bands(*4 * [0.5]), by_plant_s=1e-3 * np.array(rows))
+
+
+@pytest.mark.parametrize(
+    ("y", "is_told"),
+    [
+        (late_by_plant(0.5, 0.45, 0.6, None, None), True),
+        # Bed slinger 26 of benchmarks/closed_chain.py: .1 ms in truth.
+        (late_by_plant(0.5, -0.13, 0.8, 0.1, None), False),
+        (late_by_plant(0.5, 0.5, None, None, None), False),
+        # What is no set says nothing.
+        (late_by_plant(0.5, None), True),
+    ],
+)
+def test_the_plants_of_a_set_must_tell_the_same(y: Lateness, is_told: bool) -> None:
+    found = timed(BOTH, {"x": [ON_TIME], "y": 2 * [y]})
+    assert delay_of(found["y"].plants.nominal) == pytest.approx(
+        0.2e-3 if is_told else 0.0, rel=1e-4
+    )
+    assert bool(found["y"].notes) is is_told
+    # The other way round it is X that is later.
+    found = timed(BOTH, {"x": 2 * [y], "y": [ON_TIME]})
+    assert bool(found["x"].notes) is is_told
+
+
 def test_other_places_have_the_delay_too() -> None:
     pairs = (PairsSpec(poles=(PolePair(f_hz=f, zeta=0.08),)) for f in (40.0, 52.0))
     low, high = (one.without_delay() for one in pairs)

@@ -12,7 +12,9 @@ from stillpath.models.identification.averaging import mean_response
 from stillpath.models.identification.estimation import estimate_aligned, estimate_response
 from stillpath.models.identification.friction import better_explained, dry_friction, freed
 from stillpath.models.identification.nozzle import frame_of
+from stillpath.models.identification.synthetic import LIS2DW, simulate_log
 from stillpath.models.identification.types import AccelerationLog, Excitation, FrequencyResponse
+from stillpath.models.plants import RelativeMode, RelativeModesSpec
 from stillpath.simulation.printers.drawing import draw
 from stillpath.simulation.printers.machines import Printer
 from stillpath.simulation.printers.resonance_test import NEW_TEST, OLD_TEST, drawn_sensor, run_test
@@ -106,3 +108,14 @@ def test_guides_that_stick_above_the_resonance_act_as_springs(seed: int, test: E
         return float(np.median(np.abs(np.abs(found.response[sticks]) - true) / true))
 
     assert error(both) < 0.5 * error(sliding)
+
+
+def test_a_start_ever_later_is_no_friction() -> None:
+    """A test from 20 Hz: 4.6 µm were found with a start 8 ms earlier, the earliest tried."""
+    test = Excitation((1.0, 0.0), 20.0, 120.0, 75.0, 1.0, 0.0, out_and_back=True)
+    free = RelativeModesSpec(modes=(RelativeMode(f_hz=48.0, zeta=0.05, share=1.0),))
+    rng = np.random.default_rng([1, 1])
+    log = simulate_log({"x": free}, test, sensor=LIS2DW, lead_s=0.0, tail_s=0.0, rng=rng)
+    aligned = align(log, test)
+    response = estimate_response(log, test, aligned=aligned)
+    assert dry_friction([aligned], [[response]]).held_mm == 0.0

@@ -209,6 +209,31 @@ def test_a_level_that_only_the_fit_shows() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("accel_per_hz_mm_s", "settings", "warned"),
+    [
+        (60.0, {}, True),
+        (75.0, {}, False),
+        (60.0, {"accel_per_hz_mm_s": 60.0}, False),
+    ],
+)
+def test_a_log_without_slow_sweep_may_be_of_klippers_weaker_test(
+    accel_per_hz_mm_s: float, settings: dict[str, float], *, warned: bool
+) -> None:
+    """`sweeping_period: 0` of Klipper since 2024-12; Kalico's test lasts as long."""
+    test = replace(
+        SWEEPING,
+        accel_per_hz_mm_s=accel_per_hz_mm_s,
+        sweeping_accel_mm_s2=0.0,
+        sweeping_period_s=0.0,
+    )
+    file = quick_raw("x", test=test, lead_s=0.0, tail_s=0.0)
+    found = one(file, settings=ReadSettings.model_validate(settings))
+    texts = [text for text in found.warnings if "sweeping_period 0: state yours" in text]
+    assert len(texts) == warned
+    assert main_mode(found) == pytest.approx(42.0, rel=0.005)
+
+
 def test_axes_of_the_sensor_that_seem_exchanged() -> None:
     swapped = Sensor(rate_hz=500.0, rotation=((0, 1, 0), (1, 0, 0), (0, 0, -1)))
     files = [quick_raw(axis, sensor=swapped) for axis in "xy"]
@@ -291,18 +316,20 @@ def test_a_log_of_m956_without_a_test() -> None:
 
 
 @pytest.mark.slow
-def test_a_sensor_whose_range_ended() -> None:
-    log = quick_log("x")
-    largest = float(np.abs(log.accel_mm_s2[:, 0]).max())
+@pytest.mark.parametrize("column", ["x", "y"])
+def test_a_sensor_whose_range_ended(column: str) -> None:
+    turned = QUICK_SENSOR if column == "x" else replace(QUICK_SENSOR, rotation=TURNED_ROUND_Z)
+    log = quick_log("x", sensor=turned)
+    largest = float(np.abs(log.accel_mm_s2[:, "xyz".index(column)]).max())
 
     def clipped(share: float) -> InputFile:
         accel = np.clip(log.accel_mm_s2, -share * largest, share * largest)
         return raw_file(replace(log, accel_mm_s2=accel))
 
     found = one(clipped(0.9))
-    assert sum("the sensor's x stops at" in w for w in found.warnings) == 1
+    assert sum(f"the sensor's {column} stops at" in w for w in found.warnings) == 1
     # With more of it, damping came out up to three times too large, and friction was blamed.
-    with pytest.raises(ModelError, match=r"csv: the sensor's x stops at .* range ended"):
+    with pytest.raises(ModelError, match=rf"csv: the sensor's {column} stops at .* range ended"):
         one(clipped(0.7))
 
 

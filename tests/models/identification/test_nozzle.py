@@ -7,6 +7,7 @@ import pytest
 
 from stillpath.models.identification.nozzle import Frame, frame_of
 from stillpath.models.identification.types import FrequencyResponse
+from stillpath.models.plants import RelativeMode, RelativeModesSpec, frequency_response
 
 F_HZ = np.arange(24, 520) * 0.25
 
@@ -24,12 +25,12 @@ def two_bodies(frame: Frame, main_hz: float, zeta: float) -> tuple[np.ndarray, n
     return felt, felt * (1 + moving * s**2 / feet)
 
 
-def measured(response: np.ndarray, seed: int = 0) -> FrequencyResponse:
+def measured(response: np.ndarray, seed: int = 0, noise: float = 0.003) -> FrequencyResponse:
     rng = np.random.default_rng(seed)
-    noise = 0.003 * (rng.standard_normal(len(F_HZ)) + 1j * rng.standard_normal(len(F_HZ)))
+    noises = noise * (rng.standard_normal(len(F_HZ)) + 1j * rng.standard_normal(len(F_HZ)))
     late = 0.93 * np.exp(-2j * np.pi * F_HZ * 2.3e-3)
-    sd = np.full(len(F_HZ), 0.004)
-    return FrequencyResponse(F_HZ, late * response + noise, sd, np.ones(len(F_HZ)))
+    sd = np.full(len(F_HZ), noise / 0.75)
+    return FrequencyResponse(F_HZ, late * response + noises, sd, np.ones(len(F_HZ)))
 
 
 @pytest.mark.parametrize(
@@ -53,6 +54,14 @@ def test_a_frame_is_found_and_its_motion_taken_out(
     low = 1.5 * main_hz > F_HZ
     felt_off = np.linalg.norm((measured(felt).response - true)[low])
     assert np.linalg.norm((over_bed - true)[low]) < 0.2 * felt_off
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_an_axis_whose_guides_damp_it_has_no_frame(seed: int) -> None:
+    """A frame of 6 Hz with a mode of the axis beside it explained what the guides do."""
+    guided = RelativeModesSpec(modes=(RelativeMode(f_hz=42.0, zeta=0.09, share=1.0, grounded=0.4),))
+    felt = frequency_response(guided, F_HZ)
+    assert frame_of(measured(felt, seed, noise=0.0003)) is None
 
 
 def test_derivatives_are_those_of_differences() -> None:

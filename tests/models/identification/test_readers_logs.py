@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import bz2
+import io
+import lzma
+import tarfile
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -40,11 +45,12 @@ def changed(text: str, line: int, new: str) -> str:
 
 
 @given(
-    arrays.arrays(np.float64, (80, 3), elements=st.floats(-2e5, 2e5, allow_nan=False), unique=True),
+    arrays.arrays(np.float64, (80, 3), elements=st.floats(-900, 900, allow_nan=False), unique=True),
     st.sampled_from(["", '##{"errors": 0, "overflows": 0}\n', "## LIS2DW\r\n"]),
 )
 def test_klipper_log_is_read_as_written(accel: np.ndarray, head: str) -> None:
     time_s = 12.5 + np.arange(80) / 1600
+    accel[0] = 950.0  # too much for a log in m/s^2
     log = read(klipper(time_s, accel, head))
     assert isinstance(log, AccelerationLog)
     np.testing.assert_allclose(log.time_s, time_s, atol=6e-7)
@@ -87,6 +93,51 @@ def test_a_name_that_says_another_axis_is_refused(name: str, says: str) -> None:
     words = f"{name}: its name says axis {says}.*given as axis y; give no axis, or rename the file"
     with pytest.raises(ModelError, match=words):
         read(klipper(*some_log()), name, axis="y")
+
+
+@pytest.mark.parametrize(("unit", "one_mm_s2"), [("g", 1 / 9806.65), ("m/s^2", 1e-3)])
+def test_gravity_tells_the_unit(unit: str, one_mm_s2: float) -> None:
+    time_s, accel = some_log()
+    log = read(klipper(time_s, accel * one_mm_s2))
+    assert isinstance(log, AccelerationLog)
+    np.testing.assert_allclose(log.accel_mm_s2, accel, atol=1e-6 / one_mm_s2)
+    (note,) = log.notes
+    assert f"accelerations in {unit}" in note
+    stated = read(klipper(time_s, accel * one_mm_s2), acceleration_unit=unit)
+    assert isinstance(stated, AccelerationLog)
+    np.testing.assert_array_equal(stated.accel_mm_s2, log.accel_mm_s2)
+    assert stated.notes == ()
+
+
+@pytest.mark.parametrize("numbers_too", [False, True])
+def test_a_spreadsheet_may_quote_its_fields(numbers_too: bool) -> None:
+    time_s, accel = some_log()
+    head, *rows = klipper(time_s, accel).splitlines()
+    lines = [head, *rows] if numbers_too else [head]
+    quoted = [",".join(f'"{field}"' for field in line.split(",")) for line in lines]
+    log = read("\r\n".join(quoted + ([] if numbers_too else rows)) + "\r\n")
+    assert isinstance(log, AccelerationLog)
+    np.testing.assert_allclose(log.accel_mm_s2, accel, atol=6e-7)
+
+
+def test_archives_are_to_be_unpacked() -> None:
+    text = klipper(*some_log()).encode()
+    zipped, tarred = io.BytesIO(), io.BytesIO()
+    with zipfile.ZipFile(zipped, "w") as archive:
+        archive.writestr("raw_data_x_1.csv", text)
+    with tarfile.open(fileobj=tarred, mode="w:gz") as archive:
+        entry = tarfile.TarInfo("raw_data_x_1.csv")
+        entry.size = len(text)
+        archive.addfile(entry, io.BytesIO(text))
+    packed = {
+        "zip archive": zipped.getvalue(),
+        "tar archive": tarred.getvalue(),
+        "bzip2": bz2.compress(text),
+        "xz": lzma.compress(text),
+    }
+    for kind, content in packed.items():
+        with pytest.raises(ModelError, match=rf"logs: a .*{kind}.* unpack it and give the files"):
+            read_content(content, "logs")
 
 
 def test_gap_says_where_and_how_long() -> None:

@@ -84,6 +84,19 @@ def test_raw_logs_tell_which_test_they_are_of(
     assert words in note
 
 
+def test_a_log_without_slow_sweep_of_130_s_ends_at_135_hz() -> None:
+    """As Kalico's test: to 133.33 Hz it would be too long, and its clock not be used."""
+    test = replace(LEGACY, f_end_hz=135.0, out_and_back=False)
+    log = quick_log("x", test=test, lead_s=0.0, tail_s=0.0)
+    log = replace(log, source="raw_data_x_20260601_101010.csv")
+    assert excitation_for(log) == replace(OLD, f_end_hz=135.0)
+    (note,) = excitation_notes(log)
+    assert "the log is 130 s long, as Kalico's test is to 135 Hz" in note
+    # The length of a test that was stated otherwise tells nothing.
+    assert excitation_for(log, ReadSettings(hz_per_s=2.0)) == replace(OLD, hz_per_s=2.0)
+    assert excitation_for(log, ReadSettings(f_end_hz=120.0)) == replace(OLD, f_end_hz=120.0)
+
+
 def test_a_log_that_hardly_moves_tells_nothing() -> None:
     log = quick_log("x", test=LEGACY, sensor=Sensor(rate_hz=500.0, gain=0.02))
     log = replace(log, source="raw_data_x_20250601_101010.csv")
