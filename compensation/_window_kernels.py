@@ -137,7 +137,7 @@ def solve_windows(
     slid: Array,
     weight: Array,
     stops: Ints,
-    careful: Flags,
+    bounded: Flags,
     limits: Array,
     memory: Memory,
     z: Array,
@@ -150,7 +150,7 @@ def solve_windows(
     Parameters
     ----------
     stepping, functions, rest_functions
-        `careful` windows are solved with `functions`, those that meet a stop with
+        `bounded` windows are solved with `functions`, those that meet a stop with
         `rest_functions`; all others are stepped.
     squeeze : ndarray, shape (k, nz - 2)
         Maps the plants' states to those of `rest_functions`, which may also have fewer components.
@@ -162,7 +162,7 @@ def solve_windows(
         What is added to the targets of the first n samples.
     stops : ndarray of int64, shape (k, 2)
         Ranges [a, b) of samples, rising and disjoint.
-    careful : ndarray of bool, shape (windows,)
+    bounded : ndarray of bool, shape (windows,)
     limits
         As in `tied_window`.
     memory : Memory
@@ -188,7 +188,7 @@ def solve_windows(
             met += 1
         while coming < len(stops) and stops[coming, 0] < start + window:
             coming += 1
-        if coming <= met and not careful[w]:
+        if coming <= met and not bounded[w]:
             continue
         _step(stepping, z, waiting, w, u)
         if not (memory.known[w] and _same(memory.z[w], z)):

@@ -14,7 +14,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,9 +47,6 @@ from stillpath.models.schedule import OperatingPoint
 
 __all__ = ["LADDER", "ROBUST", "UPDATE_S", "WINDOW_S", "PreviewFbf", "Rung"]
 
-_Found: TypeAlias = tuple[AxisCommand, int, frozenset[int]]
-"""Command of an axis, its rung, and the windows solved within bounds."""
-
 ROBUST = ("off", "ensemble", "minimax")
 """off: the nominal plant; ensemble: weighted least squares over the set; minimax: the same with
 weights that balance the members' errors."""
@@ -66,6 +63,14 @@ _BOUNDED_SHARE = 0.2
 _BOUNDED_ROUNDS = 4
 _REACH_S, _STRIDE = 0.03, 7
 """The nearest point of the path is searched within this time, at every 7th sample."""
+
+
+class _Solution(NamedTuple):
+    """Command of an axis, its rung, and the windows that were solved within bounds."""
+
+    command: AxisCommand
+    rung: int
+    bounded: frozenset[int]
 
 
 class PreviewFbf:
@@ -228,47 +233,47 @@ class PreviewFbf:
             AxisTask(path, weight, stops, self._bounds(i, asked[i], accel_limits[i]), rms)
             for i, (path, rms) in enumerate(zip(y_d_mm, rms_limits, strict=True))
         ]
-        found = [self._ladder(axis, task) for axis, task in zip(self._axes, tasks, strict=True)]
+        solved = [self._ladder(axis, task) for axis, task in zip(self._axes, tasks, strict=True)]
         if np.isfinite([self._motors.accel, self._motors.speed]).any():
-            found, tasks = self._within_motors(found, tasks)
-        self._last = [command for command, _, _ in found]
-        self.rungs = tuple(rung for _, rung, _ in found)
+            solved, tasks = self._within_motors(solved, tasks)
+        self._last = [one.command for one in solved]
+        self.rungs = tuple(one.rung for one in solved)
         if self.along < 1.0:
-            chosen = [(rung, careful) for _, rung, careful in found]
+            chosen = [(one.rung, one.bounded) for one in solved]
             self._last = slide(
                 self._axes, self._last, tasks, chosen, extruding, self.along, self._dt_s
             )
         return np.stack([command.position_mm for command in self._last])
 
     def _within_motors(
-        self, found: list[_Found], tasks: list[AxisTask]
-    ) -> tuple[list[_Found], list[AxisTask]]:
+        self, solved: list[_Solution], tasks: list[AxisTask]
+    ) -> tuple[list[_Solution], list[AxisTask]]:
         """Solve windows again in which X and Y together ask too much of a motor (CoreXY).
 
         Each axis may use half of what the motor bears there. Where that does not help, the commands
         are returned as they were.
         """
-        outside = self._over_limits(found, tasks)
+        outside = self._over_limits(solved, tasks)
         if not outside:
-            return found, tasks
+            return solved, tasks
         accel, speed = 0.5 * self._motors.accel, 0.5 * self._motors.speed
         halves = [replace(task, bounds=task.bounds.at_most(accel, speed)) for task in tasks]
-        tried = found
+        tried = solved
         for _ in range(_BOUNDED_ROUNDS):
             tried = [
-                (axis.command(rung, task, careful | outside), rung, careful | outside)
-                for axis, task, (_, rung, careful) in zip(self._axes, halves, tried, strict=True)
+                _solved(axis, one.rung, task, one.bounded | outside)
+                for axis, task, one in zip(self._axes, halves, tried, strict=True)
             ]
             outside = self._over_limits(tried, tasks)
             if not outside:
                 return tried, halves
-            if all(outside <= careful for _, _, careful in tried):
+            if all(outside <= one.bounded for one in tried):
                 break
-        return found, tasks
+        return solved, tasks
 
-    def _over_limits(self, found: list[_Found], tasks: list[AxisTask]) -> frozenset[int]:
+    def _over_limits(self, solved: list[_Solution], tasks: list[AxisTask]) -> frozenset[int]:
         """Return the windows in which an axis or a motor exceeds its limits, and those before."""
-        axis, (x, y) = self._axes[0], (command.position_mm for command, _, _ in found)
+        axis, (x, y) = self._axes[0], (one.command.position_mm for one in solved)
         asked = [(x, tasks[0].bounds), (y, tasks[1].bounds)]
         asked += [(x + y, self._motors), (x - y, self._motors)]
         return frozenset().union(*(axis.windows_outside(bounds, row) for row, bounds in asked))
@@ -318,20 +323,20 @@ class PreviewFbf:
             high_mm=max(travel.max_mm, asked.high_mm),
         )
 
-    def _ladder(self, axis: PreviewAxis, task: AxisTask) -> _Found:
-        """Return command, rung and the windows solved within bounds."""
+    def _ladder(self, axis: PreviewAxis, task: AxisTask) -> _Solution:
+        """Return the command of the most accurate rung that keeps the limits."""
         for rung in range(axis.rung, axis.last_rung):
             # A design may fail its acceptance where a gentler one does not.
             with contextlib.suppress(DesignError):
                 return self._on_rung(axis, rung, task)
         return self._on_rung(axis, axis.last_rung, task)
 
-    def _on_rung(self, axis: PreviewAxis, rung: int, task: AxisTask) -> _Found:
+    def _on_rung(self, axis: PreviewAxis, rung: int, task: AxisTask) -> _Solution:
         dt, bounds = self._dt_s, task.bounds
-        careful: frozenset[int] = frozenset()
+        bounded: frozenset[int] = frozenset()
         for _ in range(_BOUNDED_ROUNDS + 1):
-            found = axis.command(rung, task, careful)
-            command = found.position_mm
+            solution = _solved(axis, rung, task, bounded)
+            command = solution.command.position_mm
             reached = Extremes.of(command, command[0], command[0], stops=True)
             rms = np.sqrt(reached.mean_square) / dt**2
             if rms > task.rms_limit_mm_s2 and rung < GENTLE_RUNG:
@@ -339,12 +344,12 @@ class PreviewFbf:
                 break
             if bounds.kept(reached):
                 axis.accept(rung, task, rms)
-                return found, rung, careful
+                return solution
             outside = axis.windows_outside(bounds, command)
-            few = len(careful | outside) <= max(2, _BOUNDED_SHARE * len(command) / axis.update)
-            if outside <= careful or not (few or rung == axis.last_rung):
+            few = len(bounded | outside) <= max(2, _BOUNDED_SHARE * len(command) / axis.update)
+            if outside <= bounded or not (few or rung == axis.last_rung):
                 break
-            careful |= outside
+            bounded |= outside
         path = Extremes.of(task.path_mm, task.path_mm[0], task.path_mm[0])
         raise DesignError(
             f"axis {axis.name}: even the gentlest design does not stay within "
@@ -355,6 +360,10 @@ class PreviewFbf:
             "path's acceleration, or a quarter of that limit; docs/proof.md tells how to measure "
             "what the motors bear)"
         )
+
+
+def _solved(axis: PreviewAxis, rung: int, task: AxisTask, bounded: frozenset[int]) -> _Solution:
+    return _Solution(axis.command(rung, task, bounded), rung, bounded)
 
 
 def _merged(stops: Ints) -> Ints:

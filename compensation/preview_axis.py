@@ -211,22 +211,22 @@ class PreviewAxis:
         return {int(w) for w in windows} | {int(w) - 1 for w in windows if w > 0}
 
     def command(
-        self, rung: int, task: AxisTask, careful: Set[int], targets_mm: Array | None = None
+        self, rung: int, task: AxisTask, bounded: Set[int], targets_mm: Array | None = None
     ) -> AxisCommand:
-        """Return the command of a piece; windows with rests and `careful` ones are solved singly.
+        """Return the command of a piece; windows with rests and `bounded` ones are solved singly.
 
         Parameters
         ----------
         rung : int
             Index into `Designs.ladder`.
-        careful : set of int
+        bounded : set of int
             Windows in which the bounds are kept.
         targets_mm : ndarray, shape (members, n), optional
             Desired motion of each member; by default the path.
         """
         drive = self._drive(rung, task, targets_mm)
         self._move_origin(float(task.path_mm[0]))
-        u, last_states = self._solved(rung, task, careful, drive)
+        u, last_states = self._solved(rung, task, bounded, drive)
         # The windows continue past the end of the path, where the command stands.
         n, origin, end_mm = len(task.path_mm), self._origin, float(task.path_mm[-1])
         u[n - 1] = end_mm - origin
@@ -238,13 +238,13 @@ class PreviewAxis:
         return AxisCommand(position, states - self._resting(end_mm - origin))
 
     def _solved(
-        self, rung: int, task: AxisTask, careful: Set[int], drive: _Drive
+        self, rung: int, task: AxisTask, bounded: Set[int], drive: _Drive
     ) -> tuple[Array, Array]:
         """Return the command of all windows, and the states where the last one begins."""
         design, window, update = self._designs.design(rung), self.window, self.update
         bounds = task.bounds.seen_from(self._origin)
-        alone = np.zeros(len(drive.command), bool)
-        alone[list(careful)] = True
+        is_bounded = np.zeros(len(drive.command), bool)
+        is_bounded[list(bounded)] = True
         lifted = self._designs.lifted
         functions = functions_of(design, at_rests=False)
         rest_functions = self._designs.rest_functions(rung)
@@ -274,7 +274,7 @@ class PreviewAxis:
                         drive.slid_mm,
                         drive.weight,
                         task.stops,
-                        alone,
+                        is_bounded,
                         bounds.limits(),
                         drive.memory,
                         z,

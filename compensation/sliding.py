@@ -94,16 +94,16 @@ def _within_bounds(
     axis: PreviewAxis, task: AxisTask, choice: Choice, targets_mm: Array
 ) -> tuple[AxisCommand | None, Choice]:
     """Return the command for the members' targets, on the same rung or a gentler one."""
-    rung, careful = choice
+    rung, bounded = choice
     for _ in range(_BOUNDED_ROUNDS):
-        command = axis.command(rung, task, careful, targets_mm)
+        command = axis.command(rung, task, bounded, targets_mm)
         outside = axis.windows_outside(task.bounds, command.position_mm)
         if not outside:
-            return command, (rung, careful)
-        if outside <= careful:
-            rung, careful = min(rung + 1, axis.last_rung), frozenset()
+            return command, (rung, bounded)
+        if outside <= bounded:
+            rung, bounded = min(rung + 1, axis.last_rung), frozenset()
         else:
-            careful |= outside
+            bounded |= outside
     return None, choice
 
 
