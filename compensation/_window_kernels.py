@@ -71,18 +71,18 @@ class Stepping(NamedTuple):
     ----------
     command_gain, state_gain : ndarray, shapes (update, nz) and (nz, nz)
         E and F of `run_windows`.
-    advance, drive : ndarray, shapes (nz - 2, nz - 2) and (nz, update)
+    advance, state_drive : ndarray, shapes (nz - 2, nz - 2) and (nz, update)
         As in `advance_window`.
-    command, state : ndarray, shapes (windows, update) and (windows, nz)
+    command_from_path, state_from_path : ndarray, shapes (windows, update) and (windows, nz)
         S y_d and H y_d of every window.
     """
 
     command_gain: Array
     state_gain: Array
     advance: Array
-    drive: Array
-    command: Array
-    state: Array
+    state_drive: Array
+    command_from_path: Array
+    state_from_path: Array
 
 
 class Memory(NamedTuple):
@@ -179,7 +179,7 @@ def solve_windows(
     tied : Tied
         Its solution.
     """
-    window, update = len(functions.basis), stepping.command.shape[1]
+    window, update = len(functions.basis), stepping.command_from_path.shape[1]
     met = coming = 0
     waiting = first
     for w in range(first, last):
@@ -210,7 +210,7 @@ def solve_windows(
             memory.known[w], memory.z[w] = True, z
             memory.committed[w] = tied.command[:update]
         u[start : start + update] = memory.committed[w]
-        advance_window(stepping.advance, stepping.drive, z, memory.committed[w])
+        advance_window(stepping.advance, stepping.state_drive, z, memory.committed[w])
         waiting = w + 1
     _step(stepping, z, waiting, last, u)
     row, table = np.empty(0), np.empty((0, 0))
@@ -245,8 +245,8 @@ def _step(stepping: Stepping, z: Array, first: int, last: int, u: Array) -> None
         run_windows(
             stepping.command_gain,
             stepping.state_gain,
-            stepping.command,
-            stepping.state,
+            stepping.command_from_path,
+            stepping.state_from_path,
             z,
             first,
             last,
