@@ -351,23 +351,59 @@ def _tied_problem(
     ends : ndarray, shape (k - 1, n)
         Values of the functions' commands in each rest.
     """
-    basis, summed, efforts, filtered, grams, free, reach, stop, price = functions
+    normal = _free_normal(functions, weight, moving)
+    right = np.zeros(len(normal))
+    sources, ends = _sources(functions, z[-2] - z[-1], moving, normal, right)
+    _add_errors(functions, z, targets, weight, moving, sources, normal, right)
+    factorise(normal)
+    forward(normal, right)
+    return normal, right, ends
+
+
+@kernel
+def _free_normal(functions: Functions, weight: Array, moving: Ints) -> Array:
+    """Return the normal matrix of the increments, and of the errors up to the first stop."""
+    basis = functions.basis
     window, n = basis.shape
-    rests, states = len(moving) - 1, free.shape[2]
-    first, speed = moving[0, 1], z[-2] - z[-1]
-    normal, right = price * efforts[-1], np.zeros(n)
-    if rests > 0:
+    normal: Array = functions.price * functions.efforts[-1]
+    if len(moving) > 1:
         # Untied increments are weighted too: few samples could leave the matrix singular.
         prices = np.zeros(window)
         for s, e in moving:
-            prices[s:e] = price
-        weighted_gram(efforts, basis.reshape(1, window, n), prices, normal)
+            prices[s:e] = functions.price
+        weighted_gram(functions.efforts, basis.reshape(1, window, n), prices, normal)
     squares = np.zeros(window)
-    for r in range(first):
+    for r in range(moving[0, 1]):
         squares[r] = weight[r] * weight[r]
-    weighted_gram(grams, filtered, squares, normal)
+    weighted_gram(functions.grams, functions.filtered, squares, normal)
+    return normal
 
-    # States that the functions leave behind, and those that they would have had.
+
+@kernel
+def _sources(
+    functions: Functions, speed: float, moving: Ints, normal: Array, right: Array
+) -> tuple[Array, Array]:
+    """Return the states at the borders of segments, and the functions' commands in each rest.
+
+    The increments that stop the command at each rest are added to the normal equations.
+
+    Parameters
+    ----------
+    speed : float
+        Last step of the command before the window.
+    normal, right : ndarray, shapes (n, n) and (n,)
+        Normal equations, updated in place.
+
+    Returns
+    -------
+    sources : ndarray, shape (sources, n)
+        States that the free functions would have at the start of a segment, and those that a
+        segment leaves behind, in the order of `_fill_shares`.
+    ends : ndarray, shape (k - 1, n)
+    """
+    summed, reach, price = functions.summed, functions.reach, functions.price
+    n, states = summed.shape[1], len(reach) + 2
+    rests = len(moving) - 1
     ends, position = np.zeros((rests, n)), np.zeros(n)
     sources, count = np.empty((2 * rests * states, n)), 0
     for m in range(rests + 1):
@@ -387,8 +423,25 @@ def _tied_problem(
                 add_row(-price * speed, step, right)
         if m < rests:
             ends[m] = position
-    sources = sources[:count]
+    return sources[:count], ends
 
+
+@kernel
+def _add_errors(
+    functions: Functions,
+    z: Array,
+    targets: Array,
+    weight: Array,
+    moving: Ints,
+    sources: Array,
+    normal: Array,
+    right: Array,
+) -> None:
+    """Add all errors to `right`, and those behind the first stop to `normal`, in place."""
+    filtered, free, stop = functions.filtered, functions.free, functions.stop
+    window, n = functions.basis.shape
+    rests, count = len(moving) - 1, len(sources)
+    first, speed = moving[0, 1], z[-2] - z[-1]
     shares, square, pull = (
         np.zeros((window - first, count)),
         np.zeros((count, count)),
@@ -422,9 +475,6 @@ def _tied_problem(
         normal += np.dot(sources.T, np.dot(square, sources))
     if row > 0:
         normal += np.dot(rows.T, rows)
-    factorise(normal)
-    forward(normal, right)
-    return normal, right, ends
 
 
 @kernel
