@@ -40,7 +40,7 @@ from stillpath.pipeline.measuring.measure import Measurement
 from stillpath.pipeline.measuring.points import MotionSamples, part_of
 from stillpath.pipeline.measuring.reference_shaper import cached_shaper
 from stillpath.pipeline.measuring.tracing import Trace
-from stillpath.pipeline.motion_record import MotionRecord
+from stillpath.pipeline.motion_record import Followers, MotionRecord
 from stillpath.pipeline.operating_point import Operation
 from stillpath.pipeline.options import stamp
 from stillpath.pipeline.order import Order
@@ -160,12 +160,12 @@ class Job:
             trace=trace,
             size=source.seek(0, io.SEEK_END),
         )
-        changing = None
+        followers = None
         if self._changes:
             self._verifier = Verifier(machine, options.tolerance_um)
             self._writer = StreamWriter(self._adapter, stamp(machine, options))
-            changing = self._designed.compensator, self._verifier
-        self._motion = MotionRecord(self._adapter.step_mm, self._measurement, self._sum, changing)
+            followers = Followers(self._designed.compensator, self._verifier)
+        self._motion = MotionRecord(self._adapter.step_mm, self._measurement, self._sum, followers)
         ends = (self._writer.header(), self._writer.footer()) if self._changes else ()
         self._sum.written = sum(len(text) for text in ends)
         self.retiming = Retiming(*ends, keep_times=options.times == "kept" or not self._changes)
@@ -332,7 +332,7 @@ class Job:
         self._designed.compensator.commit()
         # The last sample of an item is the first one of the next.
         written = part_of(attempt.motion, 0, len(attempt.motion) - 1)
-        self._verifier.passed(written.executed_mm)
+        self._verifier.observe(written.executed_mm)
         self._sum.add_piece(attempt.made, attempt.executed, attempt.gap_mm)
         with self._clock.stage("measure"):
             if self._budget is None or self._pairs is None:
