@@ -167,7 +167,7 @@ class Job:
             followers = Followers(self._designed.compensator, self._verifier)
         self._motion = MotionRecord(self._adapter.step_mm, self._measurement, self._sum, followers)
         ends = (self._writer.header(), self._writer.footer()) if self._changes else ()
-        self._sum.written = sum(len(text) for text in ends)
+        self._sum.written_bytes = sum(len(text) for text in ends)
         self.retiming = Retiming(*ends, keep_times=options.times == "kept" or not self._changes)
         self._sum.warnings += [*doubts(source, machine, options.dialect), *unsaid]
 
@@ -474,8 +474,8 @@ class Job:
         self.retiming.push(text, item, delay_s)
 
     def _count(self, size: int) -> None:
-        self._sum.written += size
-        if self._sum.written > 1e6 * (self._options.max_mb or float("inf")):
+        self._sum.written_bytes += size
+        if self._sum.written_bytes > 1e6 * (self._options.max_mb or float("inf")):
             raise TooLarge
 
     def _say(self, stage: str, fraction: float) -> None:

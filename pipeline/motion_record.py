@@ -51,13 +51,15 @@ class MotionRecord:
     ) -> None:
         self._step_mm, self._rounds = step_mm, max(step_mm[:2]) > 0.0
         self._measurement, self._sum, self._followers = measurement, totals, followers
+        self._jumped = True
+        """Whether the followers do not know yet where the machine stands."""
 
     def begin(self, piece: Piece) -> None:
         """Let a piece begin where the machine stands."""
-        if self._sum.jumped and self._followers is not None:
+        if self._jumped and self._followers is not None:
             # The machine did not get here along the path (homing, for example).
             self._followers.compensator.reset(self._asked(piece, piece.phases).start_mm[0, :2])
-            self._sum.jumped = False
+            self._jumped = False
 
     def as_written(
         self, piece: Piece, paced: Piece, made: CompensatedPiece, executed: Phases
@@ -87,7 +89,7 @@ class MotionRecord:
             self._measurement.jump()
             if self._followers is not None:
                 self._followers.verifier.lose_position()
-                self._sum.jumped = True
+                self._jumped = True
         elif isinstance(part, Phases):
             self._sum.add_verbatim(verbatim, part)
             self._move(verbatim, part)
@@ -123,9 +125,9 @@ class MotionRecord:
             return
         compensator, verifier = self._followers
         verifier.observe(command_mm)
-        if self._sum.jumped and command_mm.shape[1]:
+        if self._jumped and command_mm.shape[1]:
             compensator.reset(command_mm[:, 0])
-            self._sum.jumped = False
+            self._jumped = False
         compensator.observe(command_mm)
 
     def _samples(

@@ -124,7 +124,7 @@ class Summary:
         yield from self.measurement.warnings()
         if self.writer is not None:
             yield from self.writer.shaper_warnings()
-            yield from self.totals.left_alone()
+            yield from self.totals.left_alone_warnings()
             yield from self._other_heads(facts)
         if self.budget is not None:
             budget, pairs = self.budget
@@ -136,7 +136,7 @@ class Summary:
         yield from self.operation.notes()
         if self.writer is not None:
             yield from self._macro_with_limits()
-            yield from self.totals.left_out(self.options.where)
+            yield from self.totals.left_out_notes(self.options.where)
             if self.options.max_mb is not None:
                 yield (
                     f"max_mb={self.options.max_mb:g}: written with where={self.options.where} and "
