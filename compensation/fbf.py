@@ -38,7 +38,7 @@ from stillpath.compensation.preview_axis import (
     AxisTask,
     PreviewAxis,
 )
-from stillpath.compensation.sliding import balanced_weights, slide
+from stillpath.compensation.sliding import balanced_weights, member_response, slide
 from stillpath.compensation.window_problem import Bounds, Extremes
 from stillpath.models.arrays import Array, Ints
 from stillpath.models.machine import Machine, MotorLimits
@@ -294,8 +294,7 @@ class PreviewFbf:
         reach = round(_REACH_S / self._dt_s)
         total = 0.0
         for j in range(count):
-            rows = zip(self._axes, command_mm, strict=True)
-            y = np.stack([axis.answer(j % axis.members, row) for axis, row in rows])
+            y = member_response(self._axes, command_mm, j)
             total += contour_square(y_d_mm, y, extruding, reach, _STRIDE)
             if total > count * enough_mm2:
                 break

@@ -200,11 +200,9 @@ class PreviewAxis:
     def windows_outside(self, bounds: Bounds, command: Array) -> set[int]:
         """Return the windows in which a command (n,) exceeds the bounds, and those before them."""
         bend, step = _changes(command)
-        slack = 1.0 + 1e-9
-        outside = command < bounds.low_mm - TRAVEL_SLACK_MM
-        outside |= command > bounds.high_mm + TRAVEL_SLACK_MM
-        outside |= np.abs(bend) > slack * bounds.accel
-        outside |= np.abs(step) > slack * bounds.speed
+        accel, speed, low_mm, high_mm = bounds.limits()
+        outside = (command < low_mm) | (command > high_mm)
+        outside |= (np.abs(bend) > accel) | (np.abs(step) > speed)
         windows = np.unique(np.flatnonzero(outside) // self.update)
         return {int(w) for w in windows} | {int(w) - 1 for w in windows if w > 0}
 

@@ -26,7 +26,7 @@ from stillpath.models.arrays import Array
 from stillpath.models.plants import DiscretePlant
 from stillpath.models.reference_motion import reference_motion
 
-__all__ = ["balanced_weights", "slide"]
+__all__ = ["balanced_weights", "member_response", "slide"]
 
 Choice = tuple[int, frozenset[int]]
 
@@ -74,8 +74,9 @@ def slide(
     reach = _reach(dt_s)
     choice = list(chosen)
     for _ in range(ROUNDS):
+        positions = [command.position_mm for command in commands]
         for j in range(members):
-            answer = _answer(axes, commands, j)
+            answer = member_response(axes, positions, j)
             move_targets(
                 path, answer, extruding, along, WEIGHT_TRAVEL, reach, RELAXATION, targets[j]
             )
@@ -150,12 +151,10 @@ def balanced_weights(
         ]
         if along < 1.0:
             commands = slide(axes, commands, tasks, chosen, extruding, along, dt_s)
-        squares = np.array(
-            [
-                contour_square(path, _answer(axes, commands, j), extruding, 2 * _reach(dt_s), 3)
-                for j in range(axes[0].members)
-            ]
-        )
+        positions = [command.position_mm for command in commands]
+        answers = (member_response(axes, positions, j) for j in range(axes[0].members))
+        reach = 2 * _reach(dt_s)
+        squares = np.array([contour_square(path, y, extruding, reach, 3) for y in answers])
         for i, prior in enumerate(given):
             wanted = prior * squares
             # Geometric mean of old and new weights, as the errors depend on the weights.
@@ -165,10 +164,12 @@ def balanced_weights(
     return tuple(found[0].tolist()), tuple(found[1].tolist())
 
 
-def _answer(axes: Sequence[PreviewAxis], commands: Sequence[AxisCommand], j: int) -> Array:
-    """Return the response of member j of X and of Y; the shorter list repeats."""
-    pairs = zip(axes, commands, strict=True)
-    return np.stack([axis.answer(j % axis.members, u.position_mm) for axis, u in pairs])
+def member_response(
+    axes: Sequence[PreviewAxis], commands_mm: Sequence[Array] | Array, j: int
+) -> Array:
+    """Return the response of member j of X and of Y, shape (2, n); the shorter set repeats."""
+    pairs = zip(axes, commands_mm, strict=True)
+    return np.stack([axis.answer(j % axis.members, u) for axis, u in pairs])
 
 
 def _reach(dt_s: float) -> int:
