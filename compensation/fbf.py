@@ -153,15 +153,15 @@ class PreviewFbf:
         # Delays are not vibration: leading the path by them would help only if they were exact.
         sets = [plant_set(machine.axes[axis].without_delay(), dt_s) for axis in ("x", "y")]
         most = tuple(functions_within(machine.axes[axis].band_hz, dt_s) for axis in ("x", "y"))
-        chosen = _chosen(sets, robust, dt_s, window, update, basis, along, most)
+        weighted = _weighted(sets, robust, dt_s, window, update, basis, along, most)
         made = [
-            designs(*one, window, update, basis, functions)
-            for one, functions in zip(chosen, most, strict=True)
+            designs(plants, weights, window, update, basis, functions)
+            for (plants, weights), functions in zip(weighted, most, strict=True)
         ]
-        for one in made:
-            one.check()
-        self.lifted = tuple(one.lifted for one in made)
-        self._axes = [PreviewAxis(axis, one) for axis, one in zip(("x", "y"), made, strict=True)]
+        for axis_designs in made:
+            axis_designs.check()
+        self.lifted = tuple(axis_designs.lifted for axis_designs in made)
+        self._axes = [PreviewAxis(name, of) for name, of in zip(("x", "y"), made, strict=True)]
 
     def reset(self, position_mm: Array) -> None:
         """Assume that the machine stands still at `position_mm` (2,)."""
@@ -216,23 +216,7 @@ class PreviewFbf:
         DesignError
             If no rung of the ladder keeps the machine's limits.
         """
-        n = y_d_mm.shape[1]
-        weight = np.where(extruding, 1.0, WEIGHT_TRAVEL)
-        for a, b in rests:
-            weight[a:b] = WEIGHT_REST
-        ends = np.array([[-1, 1], [n, n + self._axes[0].window]], dtype=np.int64)
-        stops = _merged(np.concatenate([ends[:1], rests, ends[1:]]))
-        asked = [Extremes.of(path, path[0], path[0]) for path in y_d_mm]
-        rms_limit = np.inf
-        if n > 2:
-            largest = max(one.mean_square for one in asked)
-            rms_limit = RMS_RATIO * np.sqrt(largest) / self._dt_s**2
-        rms_limits = np.where(self._unused, np.inf, rms_limit)
-        accel_limits = self._accel_limits_mm_s2(asked)
-        tasks = [
-            AxisTask(path, weight, stops, self._bounds(i, asked[i], accel_limits[i]), rms)
-            for i, (path, rms) in enumerate(zip(y_d_mm, rms_limits, strict=True))
-        ]
+        tasks = self._tasks(y_d_mm, extruding, rests)
         solved = [self._ladder(axis, task) for axis, task in zip(self._axes, tasks, strict=True)]
         if np.isfinite([self._motors.accel, self._motors.speed]).any():
             solved, tasks = self._within_motors(solved, tasks)
@@ -244,6 +228,26 @@ class PreviewFbf:
                 self._axes, self._last, tasks, chosen, extruding, self.along, self._dt_s
             )
         return np.stack([command.position_mm for command in self._last])
+
+    def _tasks(self, y_d_mm: Array, extruding: NDArray[np.bool_], rests: Ints) -> list[AxisTask]:
+        """Return the problems of X and Y for a piece: weights, stops and limits."""
+        n = y_d_mm.shape[1]
+        weight = np.where(extruding, 1.0, WEIGHT_TRAVEL)
+        for a, b in rests:
+            weight[a:b] = WEIGHT_REST
+        around = np.array([[-1, 1], [n, n + self._axes[0].window]], dtype=np.int64)
+        stops = _merged(np.concatenate([around, rests]))
+        asked = [Extremes.of(path, path[0], path[0]) for path in y_d_mm]
+        rms_limit = np.inf
+        if n > 2:
+            largest = max(one.mean_square for one in asked)
+            rms_limit = RMS_RATIO * np.sqrt(largest) / self._dt_s**2
+        rms_limits = np.where(self._unused, np.inf, rms_limit)
+        accel_limits = self._accel_limits_mm_s2(asked)
+        return [
+            AxisTask(path, weight, stops, self._bounds(i, asked[i], accel_limits[i]), rms)
+            for i, (path, rms) in enumerate(zip(y_d_mm, rms_limits, strict=True))
+        ]
 
     def _within_motors(
         self, solved: list[_Solution], tasks: list[AxisTask]
@@ -376,10 +380,16 @@ def _merged(stops: Ints) -> Ints:
     return np.array(spans, dtype=np.int64)
 
 
-def _chosen(
+def _weighted(
     sets: list[PlantSet], robust: str, *design: Any
 ) -> list[tuple[tuple[DiscretePlant, ...], tuple[float, ...]]]:
-    """Return the plants and weights of X and Y for a robust mode."""
+    """Return the plants and weights of X and Y for a robust mode.
+
+    Parameters
+    ----------
+    design
+        dt_s and what follows it in `compensation.sliding.balanced_weights`.
+    """
     if robust == "off":
         return [((plants.nominal,), (1.0,)) for plants in sets]
     given = [(plants.members, tuple(plants.weights.tolist())) for plants in sets]
