@@ -11,7 +11,8 @@ from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.slicers.facts import SlicerFacts
 from stillpath.models.confirmation import confirmation_text, um_text
 from stillpath.models.machine import Machine
-from stillpath.pipeline.caution import Choice, prediction_note, stated_note
+from stillpath.pipeline.caution import Choice
+from stillpath.pipeline.caution_notes import prediction_note, stated_note
 from stillpath.pipeline.clock import StageClock
 from stillpath.pipeline.measuring.measure import Measurement
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
