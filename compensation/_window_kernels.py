@@ -337,7 +337,7 @@ def _tied_problem(
     z : ndarray, shape (nz,)
         Member states and the last two commands.
     targets : ndarray, shape (components, window)
-        Target of each component of the set: `lifted.target` times the path, or close to it.
+        Target of each component of the set: `LiftedWindow.target` times the path, or close to it.
     weight : ndarray, shape (window,)
         Weight of the errors.
     moving : ndarray of int64, shape (k, 2)

@@ -131,7 +131,7 @@ def balanced_weights(
     dt_s, window, update, basis, along
         Of the design that will use the weights.
     most : (int, int)
-        Most functions per 300 samples, as in `compensation.preview_axis.functions_within`.
+        Most functions per 300 samples, as in `compensation.ladder.functions_within`.
     """
     path, extruding = reference_motion(dt_s)
     n = path.shape[1]
