@@ -16,16 +16,16 @@ _NOTHING = 1e-100
 def run_windows(
     command_gain: NDArray[np.float64],
     state_gain: NDArray[np.float64],
-    command_drive: NDArray[np.float64],
-    state_drive: NDArray[np.float64],
+    command_from_path: NDArray[np.float64],
+    state_from_path: NDArray[np.float64],
     z: NDArray[np.float64],
     first: int,
     last: int,
     u: NDArray[np.float64],
 ) -> None:
-    """Step windows first..last-1: u = E z + (S y_d), z <- F z + (H y_d), in place.
+    """Step windows first..last-1: u = E z + S y_d, z <- F z + H y_d, in place.
 
-    `command_drive` and `state_drive` hold S y_d and H y_d with one row per window.
+    `command_from_path` holds S y_d and `state_from_path` H y_d, one row per window.
     """
     update, states = command_gain.shape
     carried = state_gain.T.copy()
@@ -33,7 +33,7 @@ def run_windows(
     for w in range(first, last):
         before[w - first] = z
         for i in range(states):
-            following[i] = state_drive[w, i]
+            following[i] = state_from_path[w, i]
         for j in range(states):
             value = z[j]
             for i in range(states):
@@ -41,21 +41,21 @@ def run_windows(
         z[:] = following
     # Only the states follow one after the other.
     out = u[first * update : last * update].reshape(last - first, update)
-    out[:] = command_drive[first:last] + np.dot(before, command_gain.T)
+    out[:] = command_from_path[first:last] + np.dot(before, command_gain.T)
 
 
 @kernel
 def advance_window(
     advance: NDArray[np.float64],
-    drive: NDArray[np.float64],
+    state_drive: NDArray[np.float64],
     z: NDArray[np.float64],
     committed: NDArray[np.float64],
 ) -> None:
     """Advance z (the plants' states and the last two commands) by a committed command, in place.
 
-    `advance` propagates the states without a command; `drive` adds the effect of the command.
+    `advance` propagates the states without a command; `state_drive` adds the effect of the command.
     """
-    following = np.dot(drive, committed)
+    following = np.dot(state_drive, committed)
     following[:-2] += np.dot(advance, z[:-2])
     z[:] = following
 

@@ -71,18 +71,18 @@ class Stepping(NamedTuple):
     ----------
     command_gain, state_gain : ndarray, shapes (update, nz) and (nz, nz)
         E and F of `run_windows`.
-    advance, drive : ndarray, shapes (nz - 2, nz - 2) and (nz, update)
+    advance, state_drive : ndarray, shapes (nz - 2, nz - 2) and (nz, update)
         As in `advance_window`.
-    command, state : ndarray, shapes (windows, update) and (windows, nz)
+    command_from_path, state_from_path : ndarray, shapes (windows, update) and (windows, nz)
         S y_d and H y_d of every window.
     """
 
     command_gain: Array
     state_gain: Array
     advance: Array
-    drive: Array
-    command: Array
-    state: Array
+    state_drive: Array
+    command_from_path: Array
+    state_from_path: Array
 
 
 class Memory(NamedTuple):
@@ -137,7 +137,7 @@ def solve_windows(
     slid: Array,
     weight: Array,
     stops: Ints,
-    careful: Flags,
+    bounded: Flags,
     limits: Array,
     memory: Memory,
     z: Array,
@@ -150,7 +150,7 @@ def solve_windows(
     Parameters
     ----------
     stepping, functions, rest_functions
-        `careful` windows are solved with `functions`, those that meet a stop with
+        `bounded` windows are solved with `functions`, those that meet a stop with
         `rest_functions`; all others are stepped.
     squeeze : ndarray, shape (k, nz - 2)
         Maps the plants' states to those of `rest_functions`, which may also have fewer components.
@@ -162,7 +162,7 @@ def solve_windows(
         What is added to the targets of the first n samples.
     stops : ndarray of int64, shape (k, 2)
         Ranges [a, b) of samples, rising and disjoint.
-    careful : ndarray of bool, shape (windows,)
+    bounded : ndarray of bool, shape (windows,)
     limits
         As in `tied_window`.
     memory : Memory
@@ -179,7 +179,7 @@ def solve_windows(
     tied : Tied
         Its solution.
     """
-    window, update = len(functions.basis), stepping.command.shape[1]
+    window, update = len(functions.basis), stepping.command_from_path.shape[1]
     met = coming = 0
     waiting = first
     for w in range(first, last):
@@ -188,7 +188,7 @@ def solve_windows(
             met += 1
         while coming < len(stops) and stops[coming, 0] < start + window:
             coming += 1
-        if coming <= met and not careful[w]:
+        if coming <= met and not bounded[w]:
             continue
         _step(stepping, z, waiting, w, u)
         if not (memory.known[w] and _same(memory.z[w], z)):
@@ -210,7 +210,7 @@ def solve_windows(
             memory.known[w], memory.z[w] = True, z
             memory.committed[w] = tied.command[:update]
         u[start : start + update] = memory.committed[w]
-        advance_window(stepping.advance, stepping.drive, z, memory.committed[w])
+        advance_window(stepping.advance, stepping.state_drive, z, memory.committed[w])
         waiting = w + 1
     _step(stepping, z, waiting, last, u)
     row, table = np.empty(0), np.empty((0, 0))
@@ -245,8 +245,8 @@ def _step(stepping: Stepping, z: Array, first: int, last: int, u: Array) -> None
         run_windows(
             stepping.command_gain,
             stepping.state_gain,
-            stepping.command,
-            stepping.state,
+            stepping.command_from_path,
+            stepping.state_from_path,
             z,
             first,
             last,
@@ -337,7 +337,7 @@ def _tied_problem(
     z : ndarray, shape (nz,)
         Member states and the last two commands.
     targets : ndarray, shape (components, window)
-        Target of each component of the set: `lifted.target` times the path, or close to it.
+        Target of each component of the set: `LiftedWindow.target` times the path, or close to it.
     weight : ndarray, shape (window,)
         Weight of the errors.
     moving : ndarray of int64, shape (k, 2)
@@ -351,23 +351,59 @@ def _tied_problem(
     ends : ndarray, shape (k - 1, n)
         Values of the functions' commands in each rest.
     """
-    basis, summed, efforts, filtered, grams, free, reach, stop, price = functions
+    normal = _free_normal(functions, weight, moving)
+    right = np.zeros(len(normal))
+    sources, ends = _sources(functions, z[-2] - z[-1], moving, normal, right)
+    _add_errors(functions, z, targets, weight, moving, sources, normal, right)
+    factorise(normal)
+    forward(normal, right)
+    return normal, right, ends
+
+
+@kernel
+def _free_normal(functions: Functions, weight: Array, moving: Ints) -> Array:
+    """Return the normal matrix of the increments, and of the errors up to the first stop."""
+    basis = functions.basis
     window, n = basis.shape
-    rests, states = len(moving) - 1, free.shape[2]
-    first, speed = moving[0, 1], z[-2] - z[-1]
-    normal, right = price * efforts[-1], np.zeros(n)
-    if rests > 0:
+    normal: Array = functions.price * functions.efforts[-1]
+    if len(moving) > 1:
         # Untied increments are weighted too: few samples could leave the matrix singular.
         prices = np.zeros(window)
         for s, e in moving:
-            prices[s:e] = price
-        weighted_gram(efforts, basis.reshape(1, window, n), prices, normal)
+            prices[s:e] = functions.price
+        weighted_gram(functions.efforts, basis.reshape(1, window, n), prices, normal)
     squares = np.zeros(window)
-    for r in range(first):
+    for r in range(moving[0, 1]):
         squares[r] = weight[r] * weight[r]
-    weighted_gram(grams, filtered, squares, normal)
+    weighted_gram(functions.grams, functions.filtered, squares, normal)
+    return normal
 
-    # States that the functions leave behind, and those that they would have had.
+
+@kernel
+def _sources(
+    functions: Functions, speed: float, moving: Ints, normal: Array, right: Array
+) -> tuple[Array, Array]:
+    """Return the states at the borders of segments, and the functions' commands in each rest.
+
+    The increments that stop the command at each rest are added to the normal equations.
+
+    Parameters
+    ----------
+    speed : float
+        Last step of the command before the window.
+    normal, right : ndarray, shapes (n, n) and (n,)
+        Normal equations, updated in place.
+
+    Returns
+    -------
+    sources : ndarray, shape (sources, n)
+        States that the free functions would have at the start of a segment, and those that a
+        segment leaves behind, in the order of `_fill_shares`.
+    ends : ndarray, shape (k - 1, n)
+    """
+    summed, reach, price = functions.summed, functions.reach, functions.price
+    n, states = summed.shape[1], len(reach) + 2
+    rests = len(moving) - 1
     ends, position = np.zeros((rests, n)), np.zeros(n)
     sources, count = np.empty((2 * rests * states, n)), 0
     for m in range(rests + 1):
@@ -387,8 +423,25 @@ def _tied_problem(
                 add_row(-price * speed, step, right)
         if m < rests:
             ends[m] = position
-    sources = sources[:count]
+    return sources[:count], ends
 
+
+@kernel
+def _add_errors(
+    functions: Functions,
+    z: Array,
+    targets: Array,
+    weight: Array,
+    moving: Ints,
+    sources: Array,
+    normal: Array,
+    right: Array,
+) -> None:
+    """Add all errors to `right`, and those behind the first stop to `normal`, in place."""
+    filtered, free, stop = functions.filtered, functions.free, functions.stop
+    window, n = functions.basis.shape
+    rests, count = len(moving) - 1, len(sources)
+    first, speed = moving[0, 1], z[-2] - z[-1]
     shares, square, pull = (
         np.zeros((window - first, count)),
         np.zeros((count, count)),
@@ -422,9 +475,6 @@ def _tied_problem(
         normal += np.dot(sources.T, np.dot(square, sources))
     if row > 0:
         normal += np.dot(rows.T, rows)
-    factorise(normal)
-    forward(normal, right)
-    return normal, right, ends
 
 
 @kernel

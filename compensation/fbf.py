@@ -14,7 +14,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +38,7 @@ from stillpath.compensation.preview_axis import (
     AxisTask,
     PreviewAxis,
 )
-from stillpath.compensation.sliding import balanced_weights, slide
+from stillpath.compensation.sliding import balanced_weights, member_response, slide
 from stillpath.compensation.window_problem import Bounds, Extremes
 from stillpath.models.arrays import Array, Ints
 from stillpath.models.machine import Machine, MotorLimits
@@ -46,9 +46,6 @@ from stillpath.models.plants import DiscretePlant, PlantSet, plant_set
 from stillpath.models.schedule import OperatingPoint
 
 __all__ = ["LADDER", "ROBUST", "UPDATE_S", "WINDOW_S", "PreviewFbf", "Rung"]
-
-_Found: TypeAlias = tuple[AxisCommand, int, frozenset[int]]
-"""Command of an axis, its rung, and the windows solved within bounds."""
 
 ROBUST = ("off", "ensemble", "minimax")
 """off: the nominal plant; ensemble: weighted least squares over the set; minimax: the same with
@@ -66,6 +63,14 @@ _BOUNDED_SHARE = 0.2
 _BOUNDED_ROUNDS = 4
 _REACH_S, _STRIDE = 0.03, 7
 """The nearest point of the path is searched within this time, at every 7th sample."""
+
+
+class _Solution(NamedTuple):
+    """Command of an axis, its rung, and the windows that were solved within bounds."""
+
+    command: AxisCommand
+    rung: int
+    bounded: frozenset[int]
 
 
 class PreviewFbf:
@@ -148,15 +153,15 @@ class PreviewFbf:
         # Delays are not vibration: leading the path by them would help only if they were exact.
         sets = [plant_set(machine.axes[axis].without_delay(), dt_s) for axis in ("x", "y")]
         most = tuple(functions_within(machine.axes[axis].band_hz, dt_s) for axis in ("x", "y"))
-        chosen = _chosen(sets, robust, dt_s, window, update, basis, along, most)
+        weighted = _weighted(sets, robust, dt_s, window, update, basis, along, most)
         made = [
-            designs(*one, window, update, basis, functions)
-            for one, functions in zip(chosen, most, strict=True)
+            designs(plants, weights, window, update, basis, functions)
+            for (plants, weights), functions in zip(weighted, most, strict=True)
         ]
-        for one in made:
-            one.check()
-        self.lifted = tuple(one.lifted for one in made)
-        self._axes = [PreviewAxis(axis, one) for axis, one in zip(("x", "y"), made, strict=True)]
+        for axis_designs in made:
+            axis_designs.check()
+        self.lifted = tuple(axis_designs.lifted for axis_designs in made)
+        self._axes = [PreviewAxis(name, of) for name, of in zip(("x", "y"), made, strict=True)]
 
     def reset(self, position_mm: Array) -> None:
         """Assume that the machine stands still at `position_mm` (2,)."""
@@ -211,12 +216,27 @@ class PreviewFbf:
         DesignError
             If no rung of the ladder keeps the machine's limits.
         """
+        tasks = self._tasks(y_d_mm, extruding, rests)
+        solved = [self._ladder(axis, task) for axis, task in zip(self._axes, tasks, strict=True)]
+        if np.isfinite([self._motors.accel, self._motors.speed]).any():
+            solved, tasks = self._within_motors(solved, tasks)
+        self._last = [one.command for one in solved]
+        self.rungs = tuple(one.rung for one in solved)
+        if self.along < 1.0:
+            chosen = [(one.rung, one.bounded) for one in solved]
+            self._last = slide(
+                self._axes, self._last, tasks, chosen, extruding, self.along, self._dt_s
+            )
+        return np.stack([command.position_mm for command in self._last])
+
+    def _tasks(self, y_d_mm: Array, extruding: NDArray[np.bool_], rests: Ints) -> list[AxisTask]:
+        """Return the problems of X and Y for a piece: weights, stops and limits."""
         n = y_d_mm.shape[1]
         weight = np.where(extruding, 1.0, WEIGHT_TRAVEL)
         for a, b in rests:
             weight[a:b] = WEIGHT_REST
-        ends = np.array([[-1, 1], [n, n + self._axes[0].window]], dtype=np.int64)
-        stops = _merged(np.concatenate([ends[:1], rests, ends[1:]]))
+        around = np.array([[-1, 1], [n, n + self._axes[0].window]], dtype=np.int64)
+        stops = _merged(np.concatenate([around, rests]))
         asked = [Extremes.of(path, path[0], path[0]) for path in y_d_mm]
         rms_limit = np.inf
         if n > 2:
@@ -224,51 +244,40 @@ class PreviewFbf:
             rms_limit = RMS_RATIO * np.sqrt(largest) / self._dt_s**2
         rms_limits = np.where(self._unused, np.inf, rms_limit)
         accel_limits = self._accel_limits_mm_s2(asked)
-        tasks = [
+        return [
             AxisTask(path, weight, stops, self._bounds(i, asked[i], accel_limits[i]), rms)
             for i, (path, rms) in enumerate(zip(y_d_mm, rms_limits, strict=True))
         ]
-        found = [self._ladder(axis, task) for axis, task in zip(self._axes, tasks, strict=True)]
-        if np.isfinite([self._motors.accel, self._motors.speed]).any():
-            found, tasks = self._within_motors(found, tasks)
-        self._last = [command for command, _, _ in found]
-        self.rungs = tuple(rung for _, rung, _ in found)
-        if self.along < 1.0:
-            chosen = [(rung, careful) for _, rung, careful in found]
-            self._last = slide(
-                self._axes, self._last, tasks, chosen, extruding, self.along, self._dt_s
-            )
-        return np.stack([command.position_mm for command in self._last])
 
     def _within_motors(
-        self, found: list[_Found], tasks: list[AxisTask]
-    ) -> tuple[list[_Found], list[AxisTask]]:
+        self, solved: list[_Solution], tasks: list[AxisTask]
+    ) -> tuple[list[_Solution], list[AxisTask]]:
         """Solve windows again in which X and Y together ask too much of a motor (CoreXY).
 
         Each axis may use half of what the motor bears there. Where that does not help, the commands
         are returned as they were.
         """
-        outside = self._over_limits(found, tasks)
+        outside = self._over_limits(solved, tasks)
         if not outside:
-            return found, tasks
+            return solved, tasks
         accel, speed = 0.5 * self._motors.accel, 0.5 * self._motors.speed
         halves = [replace(task, bounds=task.bounds.at_most(accel, speed)) for task in tasks]
-        tried = found
+        tried = solved
         for _ in range(_BOUNDED_ROUNDS):
             tried = [
-                (axis.command(rung, task, careful | outside), rung, careful | outside)
-                for axis, task, (_, rung, careful) in zip(self._axes, halves, tried, strict=True)
+                _solved(axis, one.rung, task, one.bounded | outside)
+                for axis, task, one in zip(self._axes, halves, tried, strict=True)
             ]
             outside = self._over_limits(tried, tasks)
             if not outside:
                 return tried, halves
-            if all(outside <= careful for _, _, careful in tried):
+            if all(outside <= one.bounded for one in tried):
                 break
-        return found, tasks
+        return solved, tasks
 
-    def _over_limits(self, found: list[_Found], tasks: list[AxisTask]) -> frozenset[int]:
+    def _over_limits(self, solved: list[_Solution], tasks: list[AxisTask]) -> frozenset[int]:
         """Return the windows in which an axis or a motor exceeds its limits, and those before."""
-        axis, (x, y) = self._axes[0], (command.position_mm for command, _, _ in found)
+        axis, (x, y) = self._axes[0], (one.command.position_mm for one in solved)
         asked = [(x, tasks[0].bounds), (y, tasks[1].bounds)]
         asked += [(x + y, self._motors), (x - y, self._motors)]
         return frozenset().union(*(axis.windows_outside(bounds, row) for row, bounds in asked))
@@ -289,8 +298,7 @@ class PreviewFbf:
         reach = round(_REACH_S / self._dt_s)
         total = 0.0
         for j in range(count):
-            rows = zip(self._axes, command_mm, strict=True)
-            y = np.stack([axis.answer(j % axis.members, row) for axis, row in rows])
+            y = member_response(self._axes, command_mm, j)
             total += contour_square(y_d_mm, y, extruding, reach, _STRIDE)
             if total > count * enough_mm2:
                 break
@@ -318,20 +326,20 @@ class PreviewFbf:
             high_mm=max(travel.max_mm, asked.high_mm),
         )
 
-    def _ladder(self, axis: PreviewAxis, task: AxisTask) -> _Found:
-        """Return command, rung and the windows solved within bounds."""
+    def _ladder(self, axis: PreviewAxis, task: AxisTask) -> _Solution:
+        """Return the command of the most accurate rung that keeps the limits."""
         for rung in range(axis.rung, axis.last_rung):
             # A design may fail its acceptance where a gentler one does not.
             with contextlib.suppress(DesignError):
                 return self._on_rung(axis, rung, task)
         return self._on_rung(axis, axis.last_rung, task)
 
-    def _on_rung(self, axis: PreviewAxis, rung: int, task: AxisTask) -> _Found:
+    def _on_rung(self, axis: PreviewAxis, rung: int, task: AxisTask) -> _Solution:
         dt, bounds = self._dt_s, task.bounds
-        careful: frozenset[int] = frozenset()
+        bounded: frozenset[int] = frozenset()
         for _ in range(_BOUNDED_ROUNDS + 1):
-            found = axis.command(rung, task, careful)
-            command = found.position_mm
+            solution = _solved(axis, rung, task, bounded)
+            command = solution.command.position_mm
             reached = Extremes.of(command, command[0], command[0], stops=True)
             rms = np.sqrt(reached.mean_square) / dt**2
             if rms > task.rms_limit_mm_s2 and rung < GENTLE_RUNG:
@@ -339,12 +347,12 @@ class PreviewFbf:
                 break
             if bounds.kept(reached):
                 axis.accept(rung, task, rms)
-                return found, rung, careful
+                return solution
             outside = axis.windows_outside(bounds, command)
-            few = len(careful | outside) <= max(2, _BOUNDED_SHARE * len(command) / axis.update)
-            if outside <= careful or not (few or rung == axis.last_rung):
+            few = len(bounded | outside) <= max(2, _BOUNDED_SHARE * len(command) / axis.update)
+            if outside <= bounded or not (few or rung == axis.last_rung):
                 break
-            careful |= outside
+            bounded |= outside
         path = Extremes.of(task.path_mm, task.path_mm[0], task.path_mm[0])
         raise DesignError(
             f"axis {axis.name}: even the gentlest design does not stay within "
@@ -355,6 +363,10 @@ class PreviewFbf:
             "path's acceleration, or a quarter of that limit; docs/proof.md tells how to measure "
             "what the motors bear)"
         )
+
+
+def _solved(axis: PreviewAxis, rung: int, task: AxisTask, bounded: frozenset[int]) -> _Solution:
+    return _Solution(axis.command(rung, task, bounded), rung, bounded)
 
 
 def _merged(stops: Ints) -> Ints:
@@ -368,10 +380,16 @@ def _merged(stops: Ints) -> Ints:
     return np.array(spans, dtype=np.int64)
 
 
-def _chosen(
+def _weighted(
     sets: list[PlantSet], robust: str, *design: Any
 ) -> list[tuple[tuple[DiscretePlant, ...], tuple[float, ...]]]:
-    """Return the plants and weights of X and Y for a robust mode."""
+    """Return the plants and weights of X and Y for a robust mode.
+
+    Parameters
+    ----------
+    design
+        dt_s and what follows it in `compensation.sliding.balanced_weights`.
+    """
     if robust == "off":
         return [((plants.nominal,), (1.0,)) for plants in sets]
     given = [(plants.members, tuple(plants.weights.tolist())) for plants in sets]

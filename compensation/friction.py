@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillpath.compensation.base import Compensator
-from stillpath.compensation.limits import eased, smoothed, window
+from stillpath.compensation.limits import eased, hann_weights, smoothed
 from stillpath.compensation.overlay import Overlay
 from stillpath.compensation.rests import stand_still
 from stillpath.models.arrays import Array
@@ -26,7 +26,7 @@ __all__ = ["FrictionCompensator", "against_friction"]
 _ROUNDED_S = (4e-3, 8e-3, 16e-3)
 """Lengths of the smoothing window: around each place, the first that keeps the machine's limits."""
 _PASSES, _LAST_PASSES = 4, 50
-"""Of passing over to a longer window, and to no compensation of friction."""
+"""Of cross-fading to a longer window, and to no compensation of friction."""
 _BLEND_S = 0.01
 
 
@@ -48,7 +48,7 @@ def against_friction(
     rounded_s : float
         Length of the window that smooths reversals.
     """
-    weights = window(rounded_s, dt_s)
+    weights = hann_weights(rounded_s, dt_s)
     bends = np.stack([smoothed(bend_of(row, dt_s), weights) for row in wanted_mm])
     added = np.array(held_mm)[:, None] * bends
     blend = max(2, round(_BLEND_S / dt_s))

@@ -78,7 +78,7 @@ class Designs:
         self._rest_functions: dict[PreviewDesign, Functions] = {}
 
     def rest_functions(self, rung: int) -> Functions:
-        """Return the functions for a rung's windows that contain a rest (`Condensed`)."""
+        """Return the functions for a rung's windows that contain a rest (`at_rests`)."""
         design = self.design(rung, REST_FUNCTIONS)
         if design not in self._rest_functions:
             made = functions_of(design, at_rests=True, part=self.at_rests)

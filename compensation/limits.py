@@ -10,9 +10,12 @@ from scipy.ndimage import maximum_filter1d
 from stillpath.models.arrays import Array, Mask
 from stillpath.models.machine import Machine
 
-__all__ = ["CommandBounds", "eased", "smoothed", "window"]
+__all__ = ["CommandBounds", "eased", "hann_weights", "smoothed"]
 
-_ROUNDED = 1.0 + 1e-9
+_SLACK = 1.0 + 1e-9
+"""Factor of limits that allows for rounding."""
+_LIMITS = ("velocity_mm_s", "accel_mm_s2")
+"""Names of the limits of first and second differences."""
 _REACH_S = 0.032
 """A command is replaced this far from a place beyond the limits, and partly twice as far."""
 
@@ -56,27 +59,23 @@ class CommandBounds:
         return beyond
 
 
-_LIMITS = ("velocity_mm_s", "accel_mm_s2")
-"""Of first and second differences."""
-
-
 def eased(
     u_mm: Array, gentler_mm: Array, beyond: Callable[[Array], Mask], dt_s: float, passes: int
 ) -> Array:
-    """Return a command (2, n) that passes over to a gentler one around places beyond the limits.
+    """Return a command (2, n) that is cross-faded to a gentler one around places beyond the limits.
 
-    The way over may exceed the limits too; then it begins earlier, in the next of `passes`.
+    The fade may exceed the limits too; then it begins earlier, in the next of `passes`.
     """
     for _ in range(passes):
         over = beyond(u_mm)
         if not over.any():
             break
-        u_mm = u_mm + _around(over, dt_s) * (gentler_mm - u_mm)
+        u_mm = u_mm + _fade(over, dt_s) * (gentler_mm - u_mm)
     return u_mm
 
 
-def window(length_s: float, dt_s: float) -> Array:
-    """Return a symmetric window of odd length that sums to 1."""
+def hann_weights(length_s: float, dt_s: float) -> Array:
+    """Return the weights of a Hann window of odd length, sum 1."""
     half = max(1, round(0.5 * length_s / dt_s))
     weights = np.hanning(2 * half + 3)[1:-1]
     return np.asarray(weights / weights.sum())
@@ -89,18 +88,19 @@ def smoothed(row: Array, weights: Array) -> Array:
 
 
 def _exceeds(u: Array, wanted: Array, limits: Array | float, order: int) -> Mask:
+    """Return where differences of u (2, n) exceed both the limits and the largest of `wanted`."""
     asked, own = (np.abs(np.diff(rows, order)) for rows in (u, wanted))
     most = np.maximum(own.max(axis=1, initial=0.0), limits)
-    return np.asarray(asked > _ROUNDED * most[:, None], np.bool_)
+    return np.asarray(asked > _SLACK * most[:, None], np.bool_)
 
 
 def _of_motors(u_mm: Array) -> Array:
-    """Return the way of both motors of a CoreXY."""
+    """Return the positions of both motors of a CoreXY, shape (2, n)."""
     return np.stack([u_mm[0] + u_mm[1], u_mm[0] - u_mm[1]])
 
 
-def _around(marked: Mask, dt_s: float) -> Array:
-    """Return 1 around marked samples, and less further away, shape (2, n)."""
+def _fade(marked: Mask, dt_s: float) -> Array:
+    """Return the share of the gentler command: 1 around marked samples, then down to 0, (2, n)."""
     reach = round(1.5 * _REACH_S / dt_s)
     near = maximum_filter1d(marked.astype(float), 2 * reach + 1, axis=1)
-    return np.stack([smoothed(row, window(_REACH_S, dt_s)) for row in near])
+    return np.stack([smoothed(row, hann_weights(_REACH_S, dt_s)) for row in near])

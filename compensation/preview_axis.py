@@ -74,8 +74,8 @@ class AxisCommand:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Drive:
-    """The part of a piece's command that does not depend on the plants' states.
+class _Prepared:
+    """A task as the windows of one rung need it: all that does not depend on the plants' states.
 
     Attributes
     ----------
@@ -83,10 +83,8 @@ class _Drive:
         Those of the task, relative to the start of the path, extended beyond its end.
     slid_mm : ndarray, shape (components, n), or (components, 0) where the path is the target
         What is added to the targets of the set's components.
-    command : ndarray, shape (windows, update)
-        S y_d of every window.
-    state : ndarray, shape (windows, nz)
-        H y_d.
+    command_from_path, state_from_path : ndarray, shapes (windows, update) and (windows, nz)
+        S y_d and H y_d of every window (`compensation.preview`).
     memory : Memory
         Windows solved individually.
     """
@@ -96,8 +94,8 @@ class _Drive:
     path_mm: Array
     weight: Array
     slid_mm: Array
-    command: Array
-    state: Array
+    command_from_path: Array
+    state_from_path: Array
     memory: Memory
 
 
@@ -125,7 +123,7 @@ class PreviewAxis:
         self.rung = self._next_rung = 0
         self._refused: tuple[AxisTask, int, float] | None = None
         self._room = [_ROOM] * len(designs.ladder)
-        self._made: _Drive | None = None
+        self._cached: _Prepared | None = None
         self.last_rung = len(designs.ladder) - 1
         self.reset(0.0)
 
@@ -158,7 +156,7 @@ class PreviewAxis:
         """Mark a command as executed."""
         self._origin, self._states = float(command.position_mm[-1]), command.states
         self.rung = self._next_rung
-        self._made = None
+        self._cached = None
 
     def commit_as(self, command: Array) -> None:
         """Mark a command (n,) derived from the last one as executed.
@@ -168,7 +166,7 @@ class PreviewAxis:
         self.observe(command[:-1])
         self._move_origin(float(command[-1]))
         self.rung = self._next_rung
-        self._made = None
+        self._cached = None
 
     def answer(self, member: int, command: Array) -> Array:
         """Return the response (n,) of a member of the set to a command (n,)."""
@@ -202,31 +200,29 @@ class PreviewAxis:
     def windows_outside(self, bounds: Bounds, command: Array) -> set[int]:
         """Return the windows in which a command (n,) exceeds the bounds, and those before them."""
         bend, step = _changes(command)
-        slack = 1.0 + 1e-9
-        outside = command < bounds.low_mm - TRAVEL_SLACK_MM
-        outside |= command > bounds.high_mm + TRAVEL_SLACK_MM
-        outside |= np.abs(bend) > slack * bounds.accel
-        outside |= np.abs(step) > slack * bounds.speed
+        accel, speed, low_mm, high_mm = bounds.limits()
+        outside = (command < low_mm) | (command > high_mm)
+        outside |= (np.abs(bend) > accel) | (np.abs(step) > speed)
         windows = np.unique(np.flatnonzero(outside) // self.update)
         return {int(w) for w in windows} | {int(w) - 1 for w in windows if w > 0}
 
     def command(
-        self, rung: int, task: AxisTask, careful: Set[int], targets_mm: Array | None = None
+        self, rung: int, task: AxisTask, bounded: Set[int], targets_mm: Array | None = None
     ) -> AxisCommand:
-        """Return the command of a piece; windows with rests and `careful` ones are solved singly.
+        """Return the command of a piece; windows with rests and `bounded` ones are solved singly.
 
         Parameters
         ----------
         rung : int
             Index into `Designs.ladder`.
-        careful : set of int
+        bounded : set of int
             Windows in which the bounds are kept.
         targets_mm : ndarray, shape (members, n), optional
             Desired motion of each member; by default the path.
         """
-        drive = self._drive(rung, task, targets_mm)
+        prepared = self._prepared(rung, task, targets_mm)
         self._move_origin(float(task.path_mm[0]))
-        u, last_states = self._solved(rung, task, careful, drive)
+        u, last_states = self._solved(rung, task, bounded, prepared)
         # The windows continue past the end of the path, where the command stands.
         n, origin, end_mm = len(task.path_mm), self._origin, float(task.path_mm[-1])
         u[n - 1] = end_mm - origin
@@ -238,13 +234,13 @@ class PreviewAxis:
         return AxisCommand(position, states - self._resting(end_mm - origin))
 
     def _solved(
-        self, rung: int, task: AxisTask, careful: Set[int], drive: _Drive
+        self, rung: int, task: AxisTask, bounded: Set[int], prepared: _Prepared
     ) -> tuple[Array, Array]:
         """Return the command of all windows, and the states where the last one begins."""
         design, window, update = self._designs.design(rung), self.window, self.update
         bounds = task.bounds.seen_from(self._origin)
-        alone = np.zeros(len(drive.command), bool)
-        alone[list(careful)] = True
+        is_bounded = np.zeros(len(prepared.command_from_path), bool)
+        is_bounded[list(bounded)] = True
         lifted = self._designs.lifted
         functions = functions_of(design, at_rests=False)
         rest_functions = self._designs.rest_functions(rung)
@@ -253,13 +249,14 @@ class PreviewAxis:
             design.state_gain,
             lifted.advance,
             design.state_drive,
-            drive.command,
-            drive.state,
+            prepared.command_from_path,
+            prepared.state_from_path,
         )
 
-        windows = len(drive.command)
+        windows = len(prepared.command_from_path)
         u = np.empty(windows * update)
         z, w = np.append(self._states, [0.0, 0.0]), 0
+        # Pause before the last window, to note the states there.
         for until in (windows - 1, windows):
             last_states = z[:-2].copy()
             while w < until:
@@ -269,14 +266,14 @@ class PreviewAxis:
                         functions,
                         rest_functions,
                         self._designs.at_rests.squeeze,
-                        drive.path_mm,
+                        prepared.path_mm,
                         lifted.target,
-                        drive.slid_mm,
-                        drive.weight,
+                        prepared.slid_mm,
+                        prepared.weight,
                         task.stops,
-                        alone,
+                        is_bounded,
                         bounds.limits(),
-                        drive.memory,
+                        prepared.memory,
                         z,
                         w,
                         until,
@@ -286,25 +283,25 @@ class PreviewAxis:
                     break
                 # This window needs its bounds.
                 start = w * update
-                path_mm = drive.path_mm[start : start + window]
+                path_mm = prepared.path_mm[start : start + window]
                 used = rest_functions if len(tied.moving) > 1 else functions
                 committed = u[start : start + update]
                 committed[:] = within_bounds(used, tied, z, path_mm, bounds)[:update]
-                drive.memory.known[w], drive.memory.z[w] = True, z
-                drive.memory.committed[w] = committed
+                prepared.memory.known[w], prepared.memory.z[w] = True, z
+                prepared.memory.committed[w] = committed
                 advance_window(lifted.advance, design.state_drive, z, committed)
                 w += 1
         return u, last_states
 
-    def _drive(self, rung: int, task: AxisTask, targets_mm: Array | None) -> _Drive:
-        """Return the command of a rung for a piece; the last result is reused if both are the same.
+    def _prepared(self, rung: int, task: AxisTask, targets_mm: Array | None) -> _Prepared:
+        """Prepare a task for a rung; the last result is reused if both are the same.
 
         A piece is often requested again with a few more windows within bounds. Windows with the
         same initial state are then not solved again.
         """
-        made = self._made
-        if made is not None and targets_mm is None and made.task is task and made.rung == rung:
-            return made
+        cached = self._cached
+        if cached is not None and targets_mm is None and (cached.task, cached.rung) == (task, rung):
+            return cached
         design, path = self._designs.design(rung), task.path_mm
         window, update = self.window, self.update
         padding = -(-len(path) // update) * update + window - len(path)
@@ -318,17 +315,21 @@ class PreviewAxis:
             for component, gain in zip(slid, design.target_gain, strict=True):
                 followed = np.append(component, np.zeros(padding))
                 nodes += _products(followed, gain, update)
-        command = nodes @ design.spread.T
-        state = nodes @ design.state_spread.T
+        command_from_path = nodes @ design.spread.T
+        state_from_path = nodes @ design.state_spread.T
         weight = np.full(len(padded), WEIGHT_REST)
         weight[: len(path)] = task.weight
         memory = Memory(
-            np.zeros(len(command), bool), np.empty(state.shape), np.empty(command.shape)
+            known=np.zeros(len(nodes), bool),
+            z=np.empty(state_from_path.shape),
+            committed=np.empty(command_from_path.shape),
         )
-        made = _Drive(task, rung, padded, weight, slid, command, state, memory)
+        prepared = _Prepared(
+            task, rung, padded, weight, slid, command_from_path, state_from_path, memory
+        )
         # Separate targets are passed in an array that changes: do not cache them.
-        self._made = made if targets_mm is None else None
-        return made
+        self._cached = prepared if targets_mm is None else None
+        return prepared
 
     def _move_origin(self, origin: float) -> None:
         self._states = self._states + self._resting(self._origin - origin)

@@ -187,8 +187,13 @@ class RippleCompensator(Overlay):
             for (axis, spec), table in zip(plants, self._ripple.outputs, strict=True)
         ]
         self._blend = max(2, round(_BLEND_S / dt_s))
-        self._least_mm_s2 = self.budget_mm_s2 = machine.command.accel_mm_s2
-        """Budget for a wave's acceleration in the last piece; 0: the ripple was not compensated."""
+        self._most_mm_s2 = self.budget_mm_s2 = machine.command.accel_mm_s2
+        """Budget for a wave's acceleration in the last piece."""
+
+    @property
+    def keeps_ripple(self) -> bool:
+        """Whether the last piece keeps its ripple, as the limits leave no room to compensate it."""
+        return self.budget_mm_s2 == 0.0
 
     def compensate(
         self, y_d_mm: Array, extruding: NDArray[np.bool_], rests: NDArray[np.int64]
@@ -196,7 +201,7 @@ class RippleCompensator(Overlay):
         """See `compensation.base.Compensator.compensate`."""
         wanted = self._inner.compensate(y_d_mm, extruding, rests)
         for step in _STEPS:
-            self.budget_mm_s2 = step * self._least_mm_s2
+            self.budget_mm_s2 = step * self._most_mm_s2
             u = self._undone(wanted, y_d_mm)
             u = wanted + stand_still(u - wanted, np.zeros_like(u), rests, self._blend)
             u = self._within_travel(wanted, u)
@@ -207,7 +212,7 @@ class RippleCompensator(Overlay):
 
     def _undone(self, wanted: Array, y_d: Array) -> Array:
         aim = wanted.copy()
-        room = self.budget_mm_s2 / self._least_mm_s2
+        room = self.budget_mm_s2 / self._most_mm_s2
         fir = _lowpass(_CUTOFF * math.sqrt(room))
         for row, output in enumerate(self._outputs):
             if output is not None:

@@ -26,7 +26,7 @@ from stillpath.models.arrays import Array
 from stillpath.models.plants import DiscretePlant
 from stillpath.models.reference_motion import reference_motion
 
-__all__ = ["balanced_weights", "slide"]
+__all__ = ["balanced_weights", "member_response", "slide"]
 
 Choice = tuple[int, frozenset[int]]
 
@@ -74,8 +74,9 @@ def slide(
     reach = _reach(dt_s)
     choice = list(chosen)
     for _ in range(ROUNDS):
+        positions = [command.position_mm for command in commands]
         for j in range(members):
-            answer = _answer(axes, commands, j)
+            answer = member_response(axes, positions, j)
             move_targets(
                 path, answer, extruding, along, WEIGHT_TRAVEL, reach, RELAXATION, targets[j]
             )
@@ -94,16 +95,16 @@ def _within_bounds(
     axis: PreviewAxis, task: AxisTask, choice: Choice, targets_mm: Array
 ) -> tuple[AxisCommand | None, Choice]:
     """Return the command for the members' targets, on the same rung or a gentler one."""
-    rung, careful = choice
+    rung, bounded = choice
     for _ in range(_BOUNDED_ROUNDS):
-        command = axis.command(rung, task, careful, targets_mm)
+        command = axis.command(rung, task, bounded, targets_mm)
         outside = axis.windows_outside(task.bounds, command.position_mm)
         if not outside:
-            return command, (rung, careful)
-        if outside <= careful:
-            rung, careful = min(rung + 1, axis.last_rung), frozenset()
+            return command, (rung, bounded)
+        if outside <= bounded:
+            rung, bounded = min(rung + 1, axis.last_rung), frozenset()
         else:
-            careful |= outside
+            bounded |= outside
     return None, choice
 
 
@@ -130,7 +131,7 @@ def balanced_weights(
     dt_s, window, update, basis, along
         Of the design that will use the weights.
     most : (int, int)
-        Most functions per 300 samples, as in `compensation.preview_axis.functions_within`.
+        Most functions per 300 samples, as in `compensation.ladder.functions_within`.
     """
     path, extruding = reference_motion(dt_s)
     n = path.shape[1]
@@ -150,12 +151,10 @@ def balanced_weights(
         ]
         if along < 1.0:
             commands = slide(axes, commands, tasks, chosen, extruding, along, dt_s)
-        squares = np.array(
-            [
-                contour_square(path, _answer(axes, commands, j), extruding, 2 * _reach(dt_s), 3)
-                for j in range(axes[0].members)
-            ]
-        )
+        positions = [command.position_mm for command in commands]
+        answers = (member_response(axes, positions, j) for j in range(axes[0].members))
+        reach = 2 * _reach(dt_s)
+        squares = np.array([contour_square(path, y, extruding, reach, 3) for y in answers])
         for i, prior in enumerate(given):
             wanted = prior * squares
             # Geometric mean of old and new weights, as the errors depend on the weights.
@@ -165,10 +164,12 @@ def balanced_weights(
     return tuple(found[0].tolist()), tuple(found[1].tolist())
 
 
-def _answer(axes: Sequence[PreviewAxis], commands: Sequence[AxisCommand], j: int) -> Array:
-    """Return the response of member j of X and of Y; the shorter list repeats."""
-    pairs = zip(axes, commands, strict=True)
-    return np.stack([axis.answer(j % axis.members, u.position_mm) for axis, u in pairs])
+def member_response(
+    axes: Sequence[PreviewAxis], commands_mm: Sequence[Array] | Array, j: int
+) -> Array:
+    """Return the response of member j of X and of Y, shape (2, n); the shorter set repeats."""
+    pairs = zip(axes, commands_mm, strict=True)
+    return np.stack([axis.answer(j % axis.members, u) for axis, u in pairs])
 
 
 def _reach(dt_s: float) -> int:

@@ -41,7 +41,7 @@ def strayed(
     Parameters
     ----------
     gap_mm : ndarray, shape (n,)
-        From `deviation`.
+        From `pipeline.piece_compensator.deviation`.
     extruding : ndarray of bool, shape (n,)
     tolerance_mm : float
         From `follow_tolerance_mm`.

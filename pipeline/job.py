@@ -40,7 +40,7 @@ from stillpath.pipeline.measuring.measure import Measurement
 from stillpath.pipeline.measuring.points import MotionSamples, part_of
 from stillpath.pipeline.measuring.reference_shaper import cached_shaper
 from stillpath.pipeline.measuring.tracing import Trace
-from stillpath.pipeline.motion_record import MotionRecord
+from stillpath.pipeline.motion_record import Followers, MotionRecord
 from stillpath.pipeline.operating_point import Operation
 from stillpath.pipeline.options import stamp
 from stillpath.pipeline.order import Order
@@ -76,9 +76,9 @@ if TYPE_CHECKING:
 
 __all__ = ["COMPENSATED", "Attempt", "Job"]
 
-_SAID = (Unfit, GcodeError, DesignError, ModelError)
+_EXPLAINED = (Unfit, GcodeError, DesignError, ModelError)
 """Errors whose message tells the user why a piece cannot be compensated."""
-_FAULTS = (*_SAID, ArithmeticError, AssertionError, LookupError, TypeError, ValueError)
+_FAULTS = (*_EXPLAINED, ArithmeticError, AssertionError, LookupError, TypeError, ValueError)
 """These and our own bugs: only the piece concerned stays as sliced."""
 _PLANNED = (Piece, LeftOut)
 _CHOSEN = 0.2
@@ -127,9 +127,9 @@ class Job:
         budget: SpeedBudget | None = None,
     ) -> None:
         machine, options = order.machine, order.options
-        self._order, self._layers = order, layers
+        self._order, self._layers, self._budget = order, layers, budget
         self.compensated: list[tuple[int, int]] = []
-        self._kept: VerbatimPart | None = None
+        self._verbatim_before: VerbatimPart | None = None
         """The part before, if it was written as sliced."""
         self._source, self._target = source, target
         self._machine, self._options = machine, options
@@ -138,8 +138,8 @@ class Job:
         self._changes = options.method != "none"
         self._sum = Totals()
         self._adapter = adapter(machine)
-        self._sliced = Restarts(self._adapter.restart_s)
-        self._restarts = copy.copy(self._sliced)
+        self._restarts_sliced = Restarts(self._adapter.restart_s)
+        self._restarts_written = copy.copy(self._restarts_sliced)
         if self._changes and self._adapter.refusal is not None:
             raise ModelError(f"{machine.name} cannot execute this file: {self._adapter.refusal}")
         self._design(order.cache_dir or default_cache_dir())
@@ -151,7 +151,6 @@ class Job:
         self._splitter = Splitter(machine, compensate=self._changes)
         self._selection = Selection(options.where, machine)
         self._operation = Operation(machine)
-        self._budget = budget
         measures = BudgetMeasurement if options.paced else Measurement
         self._measurement = measures(
             machine,
@@ -161,14 +160,14 @@ class Job:
             trace=trace,
             size=source.seek(0, io.SEEK_END),
         )
-        changing = None
+        followers = None
         if self._changes:
             self._verifier = Verifier(machine, options.tolerance_um)
             self._writer = StreamWriter(self._adapter, stamp(machine, options))
-            changing = self._work.compensator, self._verifier
-        self._motion = MotionRecord(self._adapter.step_mm, self._measurement, self._sum, changing)
+            followers = Followers(self._designed.compensator, self._verifier)
+        self._motion = MotionRecord(self._adapter.step_mm, self._measurement, self._sum, followers)
         ends = (self._writer.header(), self._writer.footer()) if self._changes else ()
-        self._sum.written = sum(len(text) for text in ends)
+        self._sum.written_bytes = sum(len(text) for text in ends)
         self.retiming = Retiming(*ends, keep_times=options.times == "kept" or not self._changes)
         self._sum.warnings += [*doubts(source, machine, options.dialect), *unsaid]
 
@@ -180,7 +179,7 @@ class Job:
         if self._changes and not tuned_first:
             self._say("designing", 0.0)
             with self._clock.stage("design"):
-                self._work = PieceCompensator(machine, options)
+                self._designed = PieceCompensator(machine, options)
         self._say("tuning the shaper to compare with", 0.0)
         with self._clock.stage("reference shaper"):
             self._shaper = cached_shaper(machine, cache_dir, DT_S)
@@ -188,7 +187,7 @@ class Job:
         self._caution = chosen[0] if chosen else None
         self._choice = chosen[1] if chosen else None
         if tuned_first or self._caution is not None:
-            self._work = PieceCompensator(machine, options, self._shaper, self._caution)
+            self._designed = PieceCompensator(machine, options, self._shaper, self._caution)
 
     @property
     def _pairs(self) -> BudgetMeasurement | None:
@@ -219,8 +218,7 @@ class Job:
         ------
         GcodeError, TooLarge
         """
-        size = max(self._source.seek(0, io.SEEK_END), 1)
-        begun = 0.0
+        size, begun = max(self._source.seek(0, io.SEEK_END), 1), 0.0
         if self._pairs is not None and self._budget is None:
             self._budget, begun = self._chosen_paces(size), _CHOSEN
         self._source.seek(0)
@@ -287,7 +285,7 @@ class Job:
         for item in FileParts(self._source, self._reader, self._splitter, self._clock):
             with self._clock.stage("plan"):
                 # The sliced file does not stop between them.
-                late_s = self._sliced.after([item]) - self._gained_s(previous, item)
+                late_s = self._restarts_sliced.after([item]) - self._gained_s(previous, item)
             self._sum.original_s += late_s
             if self._budget is not None:
                 self._budget.passed(late_s)
@@ -325,12 +323,16 @@ class Job:
             self._put_back(piece, reason)
             return
         self.compensated.append(lines)
-        self._kept = None
-        self._restarts.after([piece])
-        self._work.compensator.commit()
+        self._accept(piece, attempt, delay_s)
+
+    def _accept(self, piece: Piece, attempt: Attempt, delay_s: float) -> None:
+        """Write and measure a piece as attempted; `delay_s` was the delay before it."""
+        self._verbatim_before = None
+        self._restarts_written.after([piece])
+        self._designed.compensator.commit()
         # The last sample of an item is the first one of the next.
         written = part_of(attempt.motion, 0, len(attempt.motion) - 1)
-        self._verifier.passed(written.executed_mm)
+        self._verifier.observe(written.executed_mm)
         self._sum.add_piece(attempt.made, attempt.executed, attempt.gap_mm)
         with self._clock.stage("measure"):
             if self._budget is None or self._pairs is None:
@@ -349,10 +351,10 @@ class Job:
         """
         lines = self._writer.leading(piece, self._checker.extruder_mm)
         blocks = self._checker.snapshot().push(lines) if lines else []
-        seconds = switching_s(blocks)
-        seconds += sum(flowing_s(self._kept, b, self._machine) for b in blocks if len(b.moves))
+        seconds, moving = switching_s(blocks), [block for block in blocks if len(block.moves)]
+        seconds += sum(flowing_s(self._verbatim_before, b, self._machine) for b in moving)
         self._motion.wait(seconds)
-        restarts = copy.copy(self._restarts)
+        restarts = copy.copy(self._restarts_written)
         restart_s = restarts.after(blocks) + restarts.after([piece], from_rest=True)
         self._sum.time_s += restart_s
         return seconds + restart_s
@@ -368,7 +370,7 @@ class Job:
         writer, checker = copy.copy(self._writer), None
         try:
             with self._clock.stage("compensate"):
-                made = self._work.compensate(paced, self._point)
+                made = self._designed.compensate(paced, self._point)
             with self._clock.stage("write"):
                 extruder_mm = self._checker.extruder_mm
                 lead = self._writer.leading(piece, extruder_mm) if piece.after_mark else b""
@@ -387,7 +389,7 @@ class Job:
             self._writer = writer
             if checker is not None:
                 self._checker = checker
-            if isinstance(error, _SAID):
+            if isinstance(error, _EXPLAINED):
                 raise
             raise Unfit(
                 f"line {int(piece.moves.line[0])}: internal error ({type(error).__name__}: "
@@ -398,13 +400,12 @@ class Job:
     def _put_back(self, piece: Piece, reason: str) -> None:
         """Write a piece as sliced and undo what was counted for it."""
         phases, seconds = piece.phases, piece.phases.duration_s
-        extruding_s = float(np.sum(phases.lasts_s[phases.prints]))
         self._sum.put_back.append(
             PutBack(
                 line_first=int(piece.moves.line[0]),
                 line_last=int(piece.moves.line[-1]),
                 seconds=seconds,
-                extruding_seconds=extruding_s,
+                extruding_seconds=float(np.sum(phases.lasts_s[phases.prints])),
                 reason=reason,
             )
         )
@@ -424,9 +425,9 @@ class Job:
             # Our own lines can also add standstill, or lengthen the file's.
             self._motion.wait(switching_s(blocks) - switching_s([verbatim]))
             if stops_in(blocks) == stops_in([verbatim]):
-                self._sum.time_s -= self._gained_s(self._kept, verbatim)
-            self._kept = verbatim
-        self._sum.time_s += self._restarts.after(blocks)
+                self._sum.time_s -= self._gained_s(self._verbatim_before, verbatim)
+            self._verbatim_before = verbatim
+        self._sum.time_s += self._restarts_written.after(blocks)
         self._emit(text, verbatim, self.delay_s)
         self._sum.moves += len(verbatim.moves)
         self._sum.newline = verbatim.text.endswith(b"\n") if verbatim.text else self._sum.newline
@@ -463,8 +464,7 @@ class Job:
             return plan_moves(parts[0][0], parts[0][1], self._machine)
         planner = self._adapter.planner()
         phases = [planner.push_moves(moves, limits) for moves, limits in parts]
-        phases.append(planner.flush())
-        return join_phases(phases)
+        return join_phases([*phases, planner.flush()])
 
     def _emit(
         self, text: bytes, item: VerbatimPart | None = None, delay_s: float | np.ndarray = 0.0
@@ -474,8 +474,8 @@ class Job:
         self.retiming.push(text, item, delay_s)
 
     def _count(self, size: int) -> None:
-        self._sum.written += size
-        if self._sum.written > 1e6 * (self._options.max_mb or float("inf")):
+        self._sum.written_bytes += size
+        if self._sum.written_bytes > 1e6 * (self._options.max_mb or float("inf")):
             raise TooLarge
 
     def _say(self, stage: str, fraction: float) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,9 +19,16 @@ from stillpath.pipeline.piece_compensator import DT_S, CompensatedPiece, as_exec
 from stillpath.pipeline.totals import Totals
 from stillpath.pipeline.verifying import Verifier
 
-__all__ = ["MotionRecord"]
+__all__ = ["Followers", "MotionRecord"]
 
 _CHUNK = 1 << 17
+
+
+class Followers(NamedTuple):
+    """Those who must know all motion of the machine, as its vibration lasts into the next piece."""
+
+    compensator: Compensator
+    verifier: Verifier
 
 
 class MotionRecord:
@@ -30,8 +38,8 @@ class MotionRecord:
     ----------
     step_mm : (float, float, float, float)
         Steps of X Y Z E that the firmware rounds to; 0: it does not.
-    changing : (Compensator, Verifier), optional
-        They follow all motion of the machine; None: the file is not changed.
+    followers : Followers, optional
+        None: the file is not changed.
     """
 
     def __init__(
@@ -39,17 +47,19 @@ class MotionRecord:
         step_mm: tuple[float, float, float, float],
         measurement: Measurement,
         totals: Totals,
-        changing: tuple[Compensator, Verifier] | None,
+        followers: Followers | None,
     ) -> None:
         self._step_mm, self._rounds = step_mm, max(step_mm[:2]) > 0.0
-        self._measurement, self._sum, self._changing = measurement, totals, changing
+        self._measurement, self._sum, self._followers = measurement, totals, followers
+        self._jumped = True
+        """Whether the followers do not know yet where the machine stands."""
 
     def begin(self, piece: Piece) -> None:
         """Let a piece begin where the machine stands."""
-        if self._sum.jumped and self._changing is not None:
+        if self._jumped and self._followers is not None:
             # The machine did not get here along the path (homing, for example).
-            self._changing[0].reset(self._asked(piece, piece.phases).start_mm[0, :2])
-            self._sum.jumped = False
+            self._followers.compensator.reset(self._asked(piece, piece.phases).start_mm[0, :2])
+            self._jumped = False
 
     def as_written(
         self, piece: Piece, paced: Piece, made: CompensatedPiece, executed: Phases
@@ -77,9 +87,9 @@ class MotionRecord:
         """Measure a verbatim part: motion, standing still [s], or (None) a lost position."""
         if part is None:
             self._measurement.jump()
-            if self._changing is not None:
-                self._changing[1].passed(None)
-                self._sum.jumped = True
+            if self._followers is not None:
+                self._followers.verifier.lose_position()
+                self._jumped = True
         elif isinstance(part, Phases):
             self._sum.add_verbatim(verbatim, part)
             self._move(verbatim, part)
@@ -111,13 +121,13 @@ class MotionRecord:
             self._observe(path[:2])
 
     def _observe(self, command_mm: np.ndarray) -> None:
-        if self._changing is None:
+        if self._followers is None:
             return
-        compensator, verifier = self._changing
-        verifier.passed(command_mm)
-        if self._sum.jumped and command_mm.shape[1]:
+        compensator, verifier = self._followers
+        verifier.observe(command_mm)
+        if self._jumped and command_mm.shape[1]:
             compensator.reset(command_mm[:, 0])
-            self._sum.jumped = False
+            self._jumped = False
         compensator.observe(command_mm)
 
     def _samples(

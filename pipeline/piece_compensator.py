@@ -54,19 +54,20 @@ _COARSE_GRID_MM = 1e-3
 """Three decimals do for a coarse fit: files are 5 % smaller."""
 _ACCEL_SHARES = (1.0, 0.8, 0.6, 0.5)
 """Shares of the largest acceleration, tried in turn where a motor's speed step is too large."""
-_SOFT_S = (2e-3, 4e-3, 8e-3)
+_ROUNDING_S = (2e-3, 4e-3, 8e-3)
 """Half-widths of the moving mean that rounds corners, tried in turn where they are too sharp."""
 
 _LOWER = "slice with less of it, or raise that to what the motors bear (docs/safety.md)"
 _SHORT_QUEUES = {"marlin": "Marlin", "reprapfirmware": "RepRapFirmware"}
-_ROUNDED = 1.0 + 1e-9
+_SLACK = 1.0 + 1e-9
+"""Factor of limits that allows for rounding."""
 
 
 class Unfit(ValueError):
     """A piece that should stay as sliced; the message says why."""
 
 
-class _Sudden(Unfit):
+class _TooAbrupt(Unfit):
     """A motor's speed step is too large, or the firmware cannot follow within its limits."""
 
 
@@ -77,7 +78,8 @@ class CompensatedPiece:
     Attributes
     ----------
     command_mm : ndarray, shape (4, n)
-        x y as commanded, z e as planned, on the timeline's grid.
+        x y as commanded, z as planned, e along the command (`pipeline.filament`), on the
+        timeline's grid.
     extruding : ndarray of bool, shape (n,)
     step_mm, bend_mm : float
         Longest step of the command in XY, and largest second difference of either axis.
@@ -150,36 +152,39 @@ class PieceCompensator:
         try:
             if self._machine.schedules:
                 self._operate_at(point)
-            return self._eased(piece)
+            return self._with_fallbacks(piece)
         except (DesignError, GcodeError) as error:
             raise Unfit(str(error)) from error
 
-    def _eased(self, piece: Piece) -> CompensatedPiece:
-        """Compensate with less acceleration or rounder corners where the motors need it."""
-        first: _Sudden | DesignError | None = None
+    def _with_fallbacks(self, piece: Piece) -> CompensatedPiece:
+        """Compensate a piece, more gently where its command asks too much of the motors.
+
+        Tried in turn: less acceleration; full acceleration, with motion that may stray briefly from
+        the command; rounder corners; only the acceleration that the path itself needs. If all of
+        them fail, the first refusal is raised.
+        """
+        refusals: list[_TooAbrupt | DesignError] = []
         for share in _ACCEL_SHARES:
             if not self.compensator.ease(share):
-                assert first is not None
-                raise first
+                raise refusals[0]
             try:
-                return self._compensate(piece)
-            except _Sudden as error:
-                first = first or error
+                return self._compensate_once(piece)
+            except _TooAbrupt as error:
+                refusals.append(error)
             except DesignError as error:
                 # With less acceleration it does not follow the path.
-                first = first or error
+                refusals.append(error)
                 break
         self.compensator.ease(1.0)
-        with contextlib.suppress(_Sudden, DesignError):
-            return self._compensate(piece, briefly=True)
-        for soft_s in _SOFT_S:
-            with contextlib.suppress(_Sudden, DesignError):
-                return self._compensate(piece, soft_s)
+        with contextlib.suppress(_TooAbrupt, DesignError):
+            return self._compensate_once(piece, briefly=True)
+        for rounding_s in _ROUNDING_S:
+            with contextlib.suppress(_TooAbrupt, DesignError):
+                return self._compensate_once(piece, rounding_s)
         if self.compensator.ease(0.0):
-            with contextlib.suppress(_Sudden, DesignError):
-                return self._compensate(piece)
-        assert first is not None
-        raise first
+            with contextlib.suppress(_TooAbrupt, DesignError):
+                return self._compensate_once(piece)
+        raise refusals[0]
 
     def _operate_at(self, point: OperatingPoint) -> None:
         self.compensator.operate_at(point)
@@ -192,29 +197,24 @@ class PieceCompensator:
             if self._standing is not None:
                 self._standing = Standing(here, DT_S)
 
-    def _compensate(
-        self, piece: Piece, soft_s: float = 0.0, *, briefly: bool = False
+    def _compensate_once(
+        self, piece: Piece, rounding_s: float = 0.0, *, briefly: bool = False
     ) -> CompensatedPiece:
-        """Compensate the path, or its moving mean over `soft_s` on either side.
+        """Compensate the path, or its moving mean over `rounding_s` on either side.
 
-        The motion may stray from its command `briefly`.
+        With `briefly` the motion may stray from its command for a moment (`pipeline.following`).
         """
         phases = intended(piece.phases, piece.moves.start_mm, piece.moves.end_mm, self._step_mm)
         groups = group_rows(phases)
         resting = np.array([group.rest for group in groups])
         rest_s = self.encoder.rest_durations(piece, groups)
         feeds = phases.direction[:, 3] > 0.0
-        lead_s, tail_s = self._standing_s(phases, groups, soft_s)
+        lead_s, tail_s = self._standing_s(phases, groups, rounding_s)
         # The duration of a rest depends slightly on the speeds around it: iterate until consistent.
         for _ in range(_ROUNDS):
             timeline = build_timeline(phases, groups, rest_s, DT_S, lead_s=lead_s, tail_s=tail_s)
             extruding = timeline.moving & feeds[timeline.row]
-            path = timeline.position_mm
-            wanted = _mean(path[:2], round(soft_s / DT_S))
-            xy_mm = self.compensator.compensate(wanted, extruding, timeline.rests)
-            command = np.concatenate([xy_mm, path[2:]])
-            retract_along(command, timeline, phases)
-            feed_evenly(command, extruding)
+            command = self._command(timeline, phases, extruding, rounding_s)
             self._check_travel(command[:2], timeline.row, piece)
             self._check_motors(command[:2])
             step_mm, bend_mm = peaks(command)
@@ -227,23 +227,42 @@ class PieceCompensator:
         at = np.rint(encoded.start_s / DT_S).astype(np.int64)
         row = timeline.row[np.minimum(at, len(timeline.row) - 1)]
         self._check_travel(encoded.position[:, :2].T / 1e6, row, piece)
-        ripples = getattr(self.compensator, "budget_mm_s2", None) == 0.0
+        # Not asked by type: `compensation.ripple` is slow to import and seldom needed.
+        keeps_ripple = getattr(self.compensator, "keeps_ripple", False)
         peak_mm = (step_mm, bend_mm)
         made = CompensatedPiece(
-            timeline, command, extruding, segments, encoded, *peak_mm, keeps_ripple=ripples
+            timeline, command, extruding, segments, encoded, *peak_mm, keeps_ripple=keeps_ripple
         )
         gap_mm = deviation(made, encoded.phases)
         reason = strayed(gap_mm, extruding, self._follow_mm, briefly=briefly)
         if reason is not None:
-            raise _Sudden(f"planned by the firmware's rules, {reason}{self._too_slow(piece)}")
+            raise _TooAbrupt(f"planned by the firmware's rules, {reason}{self._too_slow(piece)}")
         return made
 
+    def _command(
+        self,
+        timeline: Timeline,
+        phases: Phases,
+        extruding: NDArray[np.bool_],
+        rounding_s: float,
+    ) -> NDArray[np.float64]:
+        """Return the command of X Y Z E, shape (4, n); Z is as planned."""
+        path = timeline.position_mm
+        wanted = _mean(path[:2], round(rounding_s / DT_S))
+        xy_mm = self.compensator.compensate(wanted, extruding, timeline.rests)
+        command = np.concatenate([xy_mm, path[2:]])
+        retract_along(command, timeline, phases)
+        feed_evenly(command, extruding)
+        return command
+
     def _standing_s(
-        self, phases: Phases, groups: list[Group], soft_s: float
+        self, phases: Phases, groups: list[Group], rounding_s: float
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the standing time before and after each group."""
         made = self.compensator
-        lead_s, tail_s = (np.full(len(groups), one + soft_s) for one in (made.lead_s, made.tail_s))
+        lead_s, tail_s = (
+            np.full(len(groups), one + rounding_s) for one in (made.lead_s, made.tail_s)
+        )
         if self._standing is None:
             return lead_s, tail_s
         begin_s, end_s = self._standing.of(phases, groups)
@@ -255,15 +274,17 @@ class PieceCompensator:
         Or where a firmware with few moves in its queue stays below their speed.
         """
         command, phases = self._machine.command, piece.phases
+        kind = self._machine.firmware.kind
         xy_mm_s2 = np.abs(phases.direction[:, :2]) * phases.accel_mm_s2[:, None]
         limits = command.of("x").accel_mm_s2, command.of("y").accel_mm_s2
         for axis, asked, limit in zip("XY", xy_mm_s2.max(axis=0, initial=0.0), limits, strict=True):
-            if asked > _ROUNDED * limit:
+            # Marlin's phases stand for ramps of whole steps, with accelerations of their own.
+            if kind != "marlin" and asked > _SLACK * limit:
                 return (
                     f"; as sliced, {axis} accelerates by {asked:.0f} mm/s2, more than the "
                     f"command may ({limit:g}, command.accel_mm_s2): {_LOWER}"
                 )
-        name = _SHORT_QUEUES.get(self._machine.firmware.kind)
+        name = _SHORT_QUEUES.get(kind)
         if name is None:
             return ""
         return (
@@ -304,7 +325,7 @@ class PieceCompensator:
             if step <= limit and change <= most:
                 return segments, encoded
             tolerance *= 0.5
-        raise _Sudden(
+        raise _TooAbrupt(
             f"a motor's speed would step by {step:.0f} mm/s between two segments, and change by "
             f"{change:.0f} mm/s within a millisecond; the machine allows {limit:.0f} and "
             f"{most:.0f} mm/s (command.speed_step_mm_s, accel_mm_s2)"
@@ -353,8 +374,8 @@ class PieceCompensator:
         ):
             changes = np.diff([x + y, x - y], order)
             asked = float(np.abs(changes).max(initial=0.0)) / DT_S**order
-            if limit is not None and asked > _ROUNDED * limit:
-                raise _Sudden(
+            if limit is not None and asked > _SLACK * limit:
+                raise _TooAbrupt(
                     f"X and Y together ask a motor for {asked:.0f} {unit}; the machine allows "
                     f"{limit:.0f} {unit} (command.motors): {_LOWER}"
                 )

@@ -11,7 +11,8 @@ from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.slicers.facts import SlicerFacts
 from stillpath.models.confirmation import confirmation_text, um_text
 from stillpath.models.machine import Machine
-from stillpath.pipeline.caution import Choice, prediction_note, stated_note
+from stillpath.pipeline.caution import Choice
+from stillpath.pipeline.caution_notes import prediction_note, stated_note
 from stillpath.pipeline.clock import StageClock
 from stillpath.pipeline.measuring.measure import Measurement
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
@@ -124,7 +125,7 @@ class Summary:
         yield from self.measurement.warnings()
         if self.writer is not None:
             yield from self.writer.shaper_warnings()
-            yield from self.totals.left_alone()
+            yield from self.totals.left_alone_warnings()
             yield from self._other_heads(facts)
         if self.budget is not None:
             budget, pairs = self.budget
@@ -136,7 +137,7 @@ class Summary:
         yield from self.operation.notes()
         if self.writer is not None:
             yield from self._macro_with_limits()
-            yield from self.totals.left_out(self.options.where)
+            yield from self.totals.left_out_notes(self.options.where)
             if self.options.max_mb is not None:
                 yield (
                     f"max_mb={self.options.max_mb:g}: written with where={self.options.where} and "

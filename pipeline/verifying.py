@@ -88,17 +88,16 @@ class Verifier:
         if np.any(np.abs(end - wanted) > tolerance_mm):
             raise Unfit(f"read back, the piece ends at {end.round(6)}, not at {wanted.round(6)}")
 
-    def passed(self, command_mm: NDArray[np.float64] | None) -> None:
-        """Record motion, shape (2, n), whose vibration may last into the next piece.
-
-        None: the position is lost, and the machine stands still when motion resumes.
-        """
-        if command_mm is None:
-            self._past_mm = self._past_mm[:, :0]
-        elif command_mm.shape[1] >= _PAST:
+    def observe(self, command_mm: NDArray[np.float64]) -> None:
+        """Record motion, shape (2, n), whose vibration may last into the next piece."""
+        if command_mm.shape[1] >= _PAST:
             self._past_mm = command_mm[:2, -_PAST:].copy()
         else:
             self._past_mm = np.hstack([self._past_mm, command_mm[:2]])[:, -_PAST:]
+
+    def lose_position(self) -> None:
+        """Forget the motion so far: the machine stands still when motion resumes."""
+        self._past_mm = self._past_mm[:, :0]
 
     def check_gain(self, motion: MotionSamples, point: OperatingPoint) -> None:
         """Compare the contour error of a piece with that of the sliced file, on coarse motor steps.

@@ -90,7 +90,7 @@ def test_what_no_command_follows_is_slower(
 ) -> None:
     # An inverse asks for more acceleration than the machine allows where the plan is quickest, and
     # corners are not rounded for it here.
-    monkeypatch.setattr(piece_compensator, "_SOFT_S", ())
+    monkeypatch.setattr(piece_compensator, "_ROUNDING_S", ())
     result, _ = compensated(sliced, tmp_path, cache, method="zpetc", budget_um=40)
     assert result.put_back == []
     assert any("slower than the budget allows" in warning for warning in result.warnings)

@@ -28,9 +28,8 @@ from stillpath.pipeline.caution import (
     caution_for,
     choose_caution,
     design_mode,
-    prediction_note,
-    stated_note,
 )
+from stillpath.pipeline.caution_notes import prediction_note, stated_note
 from stillpath.pipeline.error_range import ErrorRange
 from stillpath.pipeline.measuring.reference_shaper import BestShaper, cached_shaper
 from stillpath.pipeline.options import Options

@@ -156,8 +156,8 @@ def test_what_vibrates_on_from_before_counts_for_both() -> None:
     verifier = Verifier(load_machine("ender3"), 2.0)
     motion = samples(4.0, 2.0)
     x = np.append(np.linspace(40.0, 60.0, 100), np.full(10, 60.0))
-    verifier.passed(np.stack([x, np.linspace(30.0, 50.0, 110)]))
+    verifier.observe(np.stack([x, np.linspace(30.0, 50.0, 110)]))
     verifier.check_gain(motion, EMPTY)
-    verifier.passed(None)
+    verifier.lose_position()
     with pytest.raises(Unfit, match="as sliced"):
         verifier.check_gain(motion, EMPTY)
