@@ -11,7 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stillpath.models.errors import ModelError
-from stillpath.models.identification.readers import ReadSettings, read_content, read_measurements
+from stillpath.models.identification.readers import (
+    ReadSettings,
+    excitation_for,
+    read_content,
+    read_measurements,
+)
 from stillpath.models.identification.synthetic import (
     simulate_spectrum,
 )
@@ -168,6 +173,7 @@ def test_every_measured_table_is_read(shared_dir: Path) -> None:
         assert isinstance(spectrum, Spectrum)
         assert list(spectrum.psd) == ["x", "y", "z", "xyz"]
         assert spectrum.axis == path.name.split("_")[1]
+        assert excitation_for(spectrum).f_end_hz == pytest.approx(10000 / 75)
         written = np.loadtxt(path, delimiter=",", skiprows=1)
         np.testing.assert_allclose(spectrum.f_hz, written[:, 0], atol=0.0501)
         np.testing.assert_array_equal(spectrum.psd["xyz"], written[:, 4])
