@@ -76,6 +76,7 @@ from stillpath.models.identification.trust import (
     check_axes,
     check_directions,
     check_informative,
+    check_repeats,
 )
 from stillpath.models.identification.types import (
     AccelerationLog,
@@ -222,6 +223,8 @@ class _AxisWork:
         if self._kind != "spectrum":
             return None
         self._spectra = [self._spectrum(one) for one in self._used]
+        if not self._settings.sensor_axis:
+            check_repeats([s for s, _, _ in self._spectra], self._axis)
         self._explanations = self._explained()
         return self._explanations.frame_hz
 
