@@ -339,7 +339,8 @@ class _AxisWork:
             (s.source, note) for s, _, _ in spectra for note in excitation_notes(s, self._settings)
         ]
         if not self._settings.sensor_axis:
-            notes += table_mounting_notes(self._axis, [s for s, _, _ in spectra])
+            turned = self._settings.sensor_turned
+            notes += table_mounting_notes(self._axis, [s for s, _, _ in spectra], turned=turned)
         common = usual([c for _, _, c in spectra], self._axis)
         found = spectrum_set(
             self._explanations,

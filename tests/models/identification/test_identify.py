@@ -617,6 +617,18 @@ def test_a_table_of_the_other_axis_among_repeats_is_refused() -> None:
         identify(tables, TABLES, max_order=1)
 
 
+def test_tables_of_x_and_y_that_may_be_exchanged_are_warned_of() -> None:
+    """It stood in a note between others, and the axes were stored exchanged."""
+    exchanged = [
+        Measured(replace(quick_table(was).measurement, axis=now, source=f"{now}.csv"))
+        for was, now in ("xy", "yx")
+    ]
+    found = identify(exchanged, TABLES, max_order=1)
+    for axis, other in ("xy", "yx"):
+        text = f"{axis}.csv: the sensor's {other} moved in the test of axis {axis}"
+        assert any(text in warning for warning in found[axis].warnings)
+
+
 def test_a_sensor_that_is_turned_for_both_axes_is_no_fault() -> None:
     for rotation in (TURNED_ROUND_Z, TURNED_BY_45):
         sensor = replace(QUICK_SENSOR, rotation=rotation)
