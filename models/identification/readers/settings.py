@@ -188,8 +188,8 @@ def tested_axis(measurement: Measurement, settings: ReadSettings) -> Axis:
     text = settings.axis or measurement.axis
     if text is None:
         raise ModelError(
-            f"{measurement.source}: neither the file nor its name says clearly which axis it is "
-            "of; give the axis, x or y, or rename the file (resonances_x_1.csv)"
+            f"{measurement.source}: neither the file nor its name says which axis it is of; "
+            "give the axis, x or y, or rename the file (resonances_x_1.csv)"
         )
     try:
         x, y = direction_of(text)
