@@ -77,6 +77,7 @@ from stillpath.models.identification.trust import (
     check_axes,
     check_directions,
     check_informative,
+    check_repeats,
 )
 from stillpath.models.identification.types import (
     AccelerationLog,
@@ -223,6 +224,8 @@ class _AxisWork:
         if self._kind != "spectrum":
             return None
         self._spectra = [self._spectrum(one) for one in self._used]
+        if not self._settings.sensor_axis:
+            check_repeats([s for s, _, _ in self._spectra], self._axis)
         self._explanations = self._explained()
         return self._explanations.frame_hz
 
@@ -337,7 +340,8 @@ class _AxisWork:
             (s.source, note) for s, _, _ in spectra for note in excitation_notes(s, self._settings)
         ]
         if not self._settings.sensor_axis:
-            notes += table_mounting_notes(self._axis, [s for s, _, _ in spectra])
+            turned = self._settings.sensor_turned
+            notes += table_mounting_notes(self._axis, [s for s, _, _ in spectra], turned=turned)
         common = usual([c for _, _, c in spectra], self._axis)
         found = spectrum_set(
             self._explanations,

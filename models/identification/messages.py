@@ -82,14 +82,21 @@ def mounting_notes(axis: str, responses: Sequence[FrequencyResponse]) -> list[st
     return by_file(notes)
 
 
-def table_mounting_notes(axis: str, spectra: Sequence[Spectrum]) -> list[tuple[str, str]]:
-    """Return files and notes where a table shows the test in another of the sensor's axes."""
+def table_mounting_notes(
+    axis: str, spectra: Sequence[Spectrum], *, turned: bool = False
+) -> list[tuple[str, str]]:
+    """Return files and notes where a table shows the test in another of the sensor's axes.
+
+    A warning where that is the other axis of the plane, as files of X and Y may be exchanged;
+    not if the sensor was said to be `turned` between them.
+    """
     moved = [(one.source, *moved_most(one)) for one in spectra]
-    return [
-        (source, _turned_text(most, axis, "table"))
-        for source, most, share in moved
-        if most != axis and share > _MOSTLY
-    ]
+    notes = []
+    for source, most, share in moved:
+        if most != axis and share > _MOSTLY:
+            kind = _WARNING if most in "xy" and not turned else ""
+            notes.append((source, kind + _turned_text(most, axis, "table")))
+    return notes
 
 
 def _turned_text(most: str, axis: str, kind: str) -> str:

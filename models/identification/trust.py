@@ -22,6 +22,7 @@ __all__ = [
     "check_axes",
     "check_directions",
     "check_informative",
+    "check_repeats",
     "keeps_time",
     "main_mode",
     "main_mode_known",
@@ -192,6 +193,31 @@ def check_directions(found: Iterable[AxisIdentification], *, stated: bool = Fals
                 "twice, so measure the other one; if the sensor was mounted differently for X and "
                 "for Y, say so (option sensor_turned), or give one axis at a time"
             )
+
+
+def check_repeats(spectra: Sequence[Spectrum], axis: str) -> None:
+    """Refuse tables of an axis that moved the sensor along different ones of its directions.
+
+    Their mean would be of no axis: a renamed or misnamed table of the other one is among them.
+
+    Raises
+    ------
+    ModelError
+    """
+    moved = [(one.source, *moved_most(one)) for one in spectra]
+    clear: dict[str, list[str]] = {}
+    for source, most, share in moved:
+        if share >= _ONE_DIRECTION:
+            clear.setdefault(most, []).append(source)
+    if len(clear) < 2:
+        return
+    listed = "; ".join(f"its {most} in {', '.join(names)}" for most, names in clear.items())
+    raise ModelError(
+        f"axis {axis.upper()}: these tables moved the sensor along different axes ({listed}), so "
+        "some are of the other axis: rename those that have a wrong name, or leave them out; if "
+        f"the sensor was mounted differently between tests of {axis.upper()}, give tables of one "
+        "mounting"
+    )
 
 
 def keeps_time(found: AxisIdentification) -> bool:

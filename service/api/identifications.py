@@ -37,6 +37,8 @@ router = APIRouter(prefix="/v1/machines/{name}", tags=["machines"])
 
 _LARGEST_BYTES = 200_000_000
 _MOST_FILES = 40
+_OF_DIRECTIONS = "=,"
+"""In names of Klipper's tests of belts: resonances_axis=1.000,-1.000_a.csv."""
 _BODY = {
     "requestBody": {
         "required": True,
@@ -232,7 +234,9 @@ async def _identified(
     with tempfile.TemporaryDirectory(dir=state.intake.folder, prefix="measurements-") as folder:
         received = await _received(request, Path(folder), state.disk)
         named = [file.label.partition("@") for file in received]
-        files = [[safe_name(before), condition] for before, _, condition in named]
+        files = [
+            [safe_name(before, also=_OF_DIRECTIONS), condition] for before, _, condition in named
+        ]
         asked = ComputeRequest(
             kind=JobKind.IDENTIFICATION,
             machine=given["name"],

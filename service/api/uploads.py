@@ -176,10 +176,16 @@ async def receive_document(request: Request, *, max_bytes: int) -> bytes:
     return b"".join([chunk async for chunk in limited_body(request, max_bytes)])
 
 
-def safe_name(name: str) -> str:
-    """Return a file name without folders, control characters or surprises."""
+def safe_name(name: str, also: str = "") -> str:
+    """Return a file name without folders, control characters or surprises.
+
+    Parameters
+    ----------
+    also : str
+        Other characters that it may have.
+    """
     base = re.split(r"[/\\]", unicodedata.normalize("NFC", name))[-1]  # macOS takes letters apart
-    base = re.sub(r"[^\w .()+-]", "_", base).strip(" .")
+    base = re.sub(rf"[^\w .()+{re.escape(also)}-]", "_", base).strip(" .")
     # File systems count bytes; printers tell the kind of a file by its suffix.
     suffix = _SUFFIX.search(base)
     end = suffix[0] if suffix else ""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -186,6 +187,14 @@ def test_names_of_files_are_only_names(client: TestClient, data: Path) -> None:
         (source,) = answer.json()["report"]["sources"]
         assert not set(source["name"]) & set("/\\\n")
     assert kept(data) == before
+
+
+def test_a_test_of_belts_is_told_from_one_of_an_axis(client: TestClient) -> None:
+    """Its direction was lost from its name, and the message said to give X or Y."""
+    belts = replace(quick_raw("x"), name="raw_data_axis=1.000,-1.000_belt.csv")
+    answer = post(client, belts, trial=True)
+    assert_problem(answer, 422, belts.name, "moves both axes at once", "along X and along Y")
+    assert_problem(post(client, belts, trial=True, axis="x"), 422, "its name says axis 1.000,-1")
 
 
 def test_a_damaged_archive_is_told(client: TestClient, data: Path) -> None:

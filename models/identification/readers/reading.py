@@ -32,9 +32,13 @@ _HEAD_BYTES = 16_384
 
 _DIRECTION = r"-?\d+\.\d+,-?\d+\.\d+(?:,-?\d+\.\d+)?"
 _KLIPPER_NAME = re.compile(
-    rf"(?:raw_data|resonances|calibration_data)_(?:axis=)?({_DIRECTION}|[xyz])(?=[_.]|$)"
+    rf"(?:raw_data|resonances|calibration_data)[_ -](?:axis=)?({_DIRECTION}|[xyz])(?=[_. ]|$)"
 )
-_ANY_NAME = re.compile(rf"(?:^|[_-])(?:axis[=_-]?)?({_DIRECTION}|[xyz])(?=[_.-]|$)")
+_STATED_NAME = re.compile(
+    rf"(?<![a-z0-9])(?:axis[ =_-]?({_DIRECTION}|[xyz])|([xyz])[ _-]?axis)(?![a-z0-9])"
+)
+# With the number of a repeat: of qidi-x-max-y1.csv, x alone would count.
+_ANY_NAME = re.compile(rf"(?:^|[_-])({_DIRECTION}|[xyz])\d?(?=[_.-]|$)")
 _LOOKED_FOR = (
     "Klipper's raw log (#time,accel_x,accel_y,accel_z), Shake&Tune's .stdata, resonances "
     "or calibration data (freq,psd_x,...), M956 (Sample,X,Y,Z), a swept sine "
@@ -164,10 +168,12 @@ def _from_table(table: Table, axis: str | None, settings: ReadSettings) -> tuple
 
 
 def _axes_in_name(name: str) -> tuple[str, ...]:
-    """Return the axis in Klipper's name of a file, else every axis that the name may say."""
+    """Return the axis in Klipper's name of a file, else those it calls axis, else may mean."""
     name = name.lower()
     klipper = _KLIPPER_NAME.search(name)
-    texts = [klipper[1]] if klipper else [found[1] for found in _ANY_NAME.finditer(name)]
+    texts = [klipper[1]] if klipper else []
+    for pattern in (_STATED_NAME, _ANY_NAME):
+        texts = texts or [next(filter(None, one.groups())) for one in pattern.finditer(name)]
     return tuple(dict.fromkeys(text for text in texts if _is_axis(text)))
 
 

@@ -9,15 +9,17 @@ import numpy as np
 from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.readers.checks import check_alive, check_long, check_rising
+from stillpath.models.identification.readers.interpolated import at_bins
 from stillpath.models.identification.readers.settings import ReadSettings
 from stillpath.models.identification.readers.tables import Table
 from stillpath.models.identification.types import Spectrum
 
 __all__ = ["MOST_BINS", "is_spectrum", "read_spectrum"]
 
-MOST_BINS = 2000
+MOST_BINS = 2500
+"""Klipper writes some 130, up to 200 Hz, but every 0.2 Hz of several data sets: 2250 where max_freq
+is 300; work and memory grow with their square."""
 _LEAST_BINS = 16
-"""Klipper writes some 130, up to 200 Hz; work and memory grow with their square."""
 _PER_HZ = "accel_per_hz"
 _SHAPER = re.compile(r"\w+\([\d./]+\)|(smooth_)?(zvd?|mzv|ei|[23]hump_ei|zvd_ei|si)")
 _MIN_FREQ_HZ = 5.0
@@ -54,7 +56,7 @@ def read_spectrum(table: Table, axis: str | None, settings: ReadSettings) -> Spe
     if len(below):
         row, column = below[0]
         raise table.at(int(row), f"{names[column]} is negative: {psd[row, column]:g}")
-    f_hz = _unrounded(f_hz, table)
+    f_hz, psd = at_bins(_unrounded(f_hz, table), psd)
     notes = list(table.notes)
     if shapers or "calibration_data" in table.source:
         f_hz, psd = _undone(f_hz, psd, smooth=any(s.startswith("smooth_") for s in shapers))

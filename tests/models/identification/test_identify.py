@@ -637,6 +637,27 @@ def test_one_axis_in_the_tables_of_both_is_refused() -> None:
     assert any("sensor's x moved in the test of axis y" in note for note in found["y"].notes)
 
 
+def test_a_table_of_the_other_axis_among_repeats_is_refused() -> None:
+    """A table of Y that was called X was averaged into X."""
+    misnamed = quick_table("y")
+    renamed = replace(misnamed.measurement, axis="x", source="resonances_x_2.csv")
+    tables = [quick_table("x"), Measured(renamed), misnamed]
+    with pytest.raises(ModelError, match=r"axis X: .*its x in resonances_x_1\.csv; its y in "):
+        identify(tables, TABLES, max_order=1)
+
+
+def test_tables_of_x_and_y_that_may_be_exchanged_are_warned_of() -> None:
+    """It stood in a note between others, and the axes were stored exchanged."""
+    exchanged = [
+        Measured(replace(quick_table(was).measurement, axis=now, source=f"{now}.csv"))
+        for was, now in ("xy", "yx")
+    ]
+    found = identify(exchanged, TABLES, max_order=1)
+    for axis, other in ("xy", "yx"):
+        text = f"{axis}.csv: the sensor's {other} moved in the test of axis {axis}"
+        assert any(text in warning for warning in found[axis].warnings)
+
+
 def test_a_sensor_that_is_turned_for_both_axes_is_no_fault() -> None:
     for rotation in (TURNED_ROUND_Z, TURNED_BY_45):
         sensor = replace(QUICK_SENSOR, rotation=rotation)

@@ -70,6 +70,12 @@ def test_klipper_log_is_read_as_written(accel: np.ndarray, head: str) -> None:
         ("run-Y.csv", "y"),
         ("voron_z_tilt_raw_data_x.csv", "x"),
         ("x_max_run_y.csv", None),
+        ("qidi-x-plus-y1.csv", None),
+        ("x1.csv", "x"),
+        ("resonances_y (1).csv", "y"),
+        ("resonances x 20250101.csv", "x"),
+        ("X axis final (2).csv", "x"),
+        ("genius X Yaxis.csv", "y"),
     ],
 )
 def test_axis_is_in_the_name(name: str, axis: str | None) -> None:

@@ -186,6 +186,35 @@ def test_a_table_wider_than_its_test_keeps_the_default() -> None:
         assert any("max_freq 135" in note for note in notes) == (max_freq == 135.0)
 
 
+@pytest.mark.parametrize("max_freq", [80.0, 90.0, 100.0, 120.0])
+def test_a_test_that_ended_early_in_a_table_up_to_200_hz(max_freq: float) -> None:
+    """Vendors set max_freq to 90 or 100, with Klipper's tables of 2022: the end was a resonance."""
+    test = replace(OLD, f_end_hz=max_freq)
+    table = simulated_table(test, "resonances_x_20260101.csv")
+    mode_hz, zeta = 65.0, 0.06
+    ratio = table.f_hz / mode_hz
+    gain = np.abs((1 + 2j * zeta * ratio) / (1 - ratio**2 + 2j * zeta * ratio)) ** 2
+    rings = replace(table, psd={"x": table.psd["x"] * gain})
+    for one in (table, rings):
+        assert excitation_for(one) == test
+        assert any("max_freq is taken to be" in note for note in excitation_notes(one))
+    stated = ReadSettings(f_end_hz=130.0)
+    assert excitation_for(rings, stated).f_end_hz == 130.0
+    assert not any("is taken" in note for note in excitation_notes(rings, stated))
+
+
+@pytest.mark.parametrize("mode_hz", [38.0, 52.0, 71.0, 96.0])
+@pytest.mark.parametrize("zero", [1.1, 1.25, None])
+def test_a_resonance_is_not_the_end_of_a_test(mode_hz: float, zero: float | None) -> None:
+    table = simulated_table(OLD, "resonances_x_20230101.csv")
+    ratio = table.f_hz / mode_hz
+    gain = 1 / (1 - ratio**2 + 0.04j * ratio)
+    if zero is not None:
+        gain *= 1 - (ratio / zero) ** 2 + 0.04j * ratio / zero
+    rings = replace(table, psd={"x": table.psd["x"] * np.abs(gain) ** 2 + 1.0})
+    assert excitation_for(rings) == OLD
+
+
 def test_settings_before_file_before_defaults() -> None:
     """Kalico writes accel_per_hz of printer.cfg, also of a test with another."""
     settings = ReadSettings(accel_per_hz_mm_s=90, f_end_hz=200, firmware_date=date(2023, 1, 1))

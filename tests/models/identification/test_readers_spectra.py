@@ -11,7 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stillpath.models.errors import ModelError
-from stillpath.models.identification.readers import ReadSettings, read_content, read_measurements
+from stillpath.models.identification.readers import (
+    ReadSettings,
+    excitation_for,
+    read_content,
+    read_measurements,
+)
 from stillpath.models.identification.synthetic import (
     simulate_spectrum,
 )
@@ -112,6 +117,48 @@ def test_data_sets_with_shapers() -> None:
     np.testing.assert_allclose(spectrum.psd["b"][-50:], PSD[1, -50:], rtol=3e-3)
 
 
+def interpolated(
+    psd: np.ndarray, bins_hz: np.ndarray, end_hz: float = 202.5, more: str = ""
+) -> str:
+    """A table of two data sets as Klipper writes it since 2025-11: every 0.2 Hz."""
+    grid_hz = np.arange(0.0, end_hz, 0.2)
+    one, other = (np.interp(grid_hz, bins_hz, column) for column in psd[:2])
+    rows = [f"{f:.1f},{a:.3e},{b:.3e}{more}\n" for f, a, b in zip(grid_hz, one, other, strict=True)]
+    shapers = ",shapers:,mzv(40.2)" if more else ""
+    return f"freq,/tmp/resonances_x_a.csv,/tmp/resonances_x_b.csv{shapers}\n" + "".join(rows)
+
+
+@pytest.mark.parametrize("bin_hz", [1.0986, 1.3125, 1.5594, 1.9531])
+def test_tables_every_fifth_of_a_hertz_are_taken_back_to_bins(bin_hz: float) -> None:
+    """Whatever sensor it was, 1.5625 Hz were assumed: two modes became one."""
+    bins_hz = bin_hz * np.arange(200)
+    psd = np.random.default_rng(3).chisquare(60, (2, 200)) * 1e4
+    spectrum = read(interpolated(psd, bins_hz))
+    np.testing.assert_allclose(np.diff(spectrum.f_hz), bin_hz, rtol=1e-3)
+    found = spectrum.psd["/tmp/resonances_x_b.csv"]
+    expected = np.interp(spectrum.f_hz, bins_hz, psd[1])
+    np.testing.assert_allclose(found, expected, rtol=0.06)
+    low_psd = psd * low(bins_hz) / (bins_hz + 0.1)
+    normalised = read(interpolated(low_psd, bins_hz, more=",,0.3"), "calibration_data_x_1.csv")
+    used = normalised.f_hz > 6.0
+    back = normalised.psd["/tmp/resonances_x_b.csv"]
+    expected = np.interp(normalised.f_hz, bins_hz, psd[1])
+    np.testing.assert_allclose(back[used], expected[used], rtol=0.06)
+
+
+def test_other_fine_tables_stay_as_they_are() -> None:
+    f_hz = np.arange(0.0, 180.0, 0.2)
+    smooth = 1e4 * (2.0 + np.sin(f_hz / 3.0))
+    rows = "".join(f"{f:.1f},{p:.3e}\n" for f, p in zip(f_hz, smooth, strict=True))
+    assert len(read("freq,psd_x\n" + rows).f_hz) == len(f_hz)
+
+
+def test_the_largest_range_of_klipper_is_read() -> None:
+    """max_freq 300 makes 2250 lines."""
+    psd = np.random.default_rng(3).chisquare(60, (2, 300)) * 1e4
+    assert read(interpolated(psd, 1.5625 * np.arange(300), 450.0)).f_hz[-1] > 448.0
+
+
 def test_spectrum_faults() -> None:
     header = "freq,psd_x,psd_y,psd_z,psd_xyz"
     dead = PSD.copy()
@@ -168,6 +215,7 @@ def test_every_measured_table_is_read(shared_dir: Path) -> None:
         assert isinstance(spectrum, Spectrum)
         assert list(spectrum.psd) == ["x", "y", "z", "xyz"]
         assert spectrum.axis == path.name.split("_")[1]
+        assert excitation_for(spectrum).f_end_hz == pytest.approx(10000 / 75)
         written = np.loadtxt(path, delimiter=",", skiprows=1)
         np.testing.assert_allclose(spectrum.f_hz, written[:, 0], atol=0.0501)
         np.testing.assert_array_equal(spectrum.psd["xyz"], written[:, 4])
@@ -236,6 +284,6 @@ def test_response_faults() -> None:
 
 
 def test_a_table_of_more_rows_than_a_test_has() -> None:
-    rows = "".join(f"{0.01 * k:.2f},1.0,1.0,1.0,3.0\n" for k in range(2001))
-    with pytest.raises(ModelError, match=r"2001 frequencies, at most 2000 are read"):
+    rows = "".join(f"{0.01 * k:.2f},1.0,1.0,1.0,3.0\n" for k in range(2501))
+    with pytest.raises(ModelError, match=r"2501 frequencies, at most 2500 are read"):
         read("freq,psd_x,psd_y,psd_z,psd_xyz\n" + rows)
