@@ -407,8 +407,7 @@ class _AxisWork:
         what = f"axis {self._axis}: {measurement.source}"
         if isinstance(measurement, AccelerationLog):
             test = excitation_for(measurement, self._settings)
-            sensor = self._settings.sensor_axis
-            mounted = None if sensor is None else _SENSOR_AXES[sensor]
+            mounted = _SENSOR_AXES.get(self._settings.sensor_axis or "")
             try:
                 known = self._settings.accel_per_hz_mm_s is not None
                 aligned = align(
@@ -426,10 +425,9 @@ class _AxisWork:
             except ModelError as error:
                 # What the reader noticed may be the reason.
                 raise ModelError("; ".join([str(error), *measurement.notes])) from None
-            notes = excitation_notes(measurement, self._settings)
-            if not known:
-                notes = (*notes, *strength_notes(response, test))
-            response = replace(response, notes=(*response.notes, *notes))
+            tests = excitation_notes(measurement, self._settings)
+            levels = () if known else strength_notes(response, test)
+            response = replace(response, notes=(*response.notes, *tests, *levels))
             self._aligned.append(aligned)
         elif isinstance(measurement, DrivenLog):
             response = estimate_driven(measurement, label=label)
@@ -492,9 +490,8 @@ class _AxisWork:
         others = () if isinstance(members, ParametricMembers) else [m.plant for m in members]
         out = []
         for number, response in zip(numbers, responses, strict=True):
-            log = self._used[number].measurement
+            log, aligned = self._used[number].measurement, self._aligned[number]
             assert isinstance(log, AccelerationLog)
-            aligned = self._aligned[number]
             started_s = aligned.start_s - self._earlier_s
             out.append(lateness(log, aligned.excitation, started_s, response, plant, others))
         return out

@@ -16,6 +16,7 @@ from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
 
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.advance import feed_at_ends
@@ -42,7 +43,11 @@ from stillpath.gcode.firmware.marlin._encoder_kernels import (
 from stillpath.gcode.firmware.marlin.climbing import climb_in_long_moves
 from stillpath.gcode.firmware.marlin.limits import MarlinLimits, advance_speed_mm_s, without_advance
 from stillpath.gcode.firmware.marlin.planner import Planner, planner_facts
-from stillpath.gcode.firmware.marlin.starting import StreamLevels, gentle_accel_mm_s2
+from stillpath.gcode.firmware.marlin.starting import (
+    StreamLevels,
+    gentle_accel_mm_s2,
+    lateness_s,
+)
 from stillpath.gcode.firmware.planning import join_phases
 from stillpath.gcode.firmware.vertices import Lattice, steps_within, vertices_on_steps
 from stillpath.gcode.pieces import Piece
@@ -73,6 +78,9 @@ together along a diagonal."""
 _CALM = 0.6
 """Share of the motors' permitted speed step; the rest is for making up lost time."""
 _PASSES = 10
+_DRIFT_PASSES, _DRIFT_LINES, _EARLIER = 25, 257, 0.3
+"""Passes against lateness that adds up, of which the best counts; the lines over which it is
+averaged, and the share of it by which lines are to end earlier in the next pass."""
 _TIME_TOLERANCE_S = 5e-5
 _BYTES_PER_LINE = 36.0
 """Length of a written line with line number, checksum and its share of the acknowledgement, and a
@@ -196,8 +204,12 @@ class MarlinEncoder:
         encoded, on_time = self._with_starts(piece, timeline, segments, limits, self._start_hz)
         if on_time:
             return encoded
-        # The motors' full acceleration is better than a late piece.
-        return self._with_starts(piece, timeline, segments, limits, np.inf)[0]
+        # The motors' full acceleration is better than a late piece. Where that does not help, what
+        # each corner costs adds up faster than its corrections settle.
+        encoded, on_time = self._with_starts(piece, timeline, segments, limits, np.inf)
+        if on_time:
+            return encoded
+        return self._with_starts(piece, timeline, segments, limits, np.inf, _EARLIER)[0]
 
     def _with_starts(
         self,
@@ -206,8 +218,12 @@ class MarlinEncoder:
         segments: Segments,
         limits: MarlinLimits,
         least_hz: float,
+        earlier: float = 0.0,
     ) -> tuple[Encoded, bool]:
-        """Encode for starts from rest at a step rate; return also whether the motion keeps up."""
+        """Encode for starts from rest at a step rate; return also whether the motion keeps up.
+
+        Lines end `earlier` by that share of their lateness in the pass before, on average.
+        """
         on_steps = self._on_steps(timeline, segments, limits, least_hz)
         segments = self._advanced(piece, timeline, on_steps)
         moves = interleave(piece, timeline, segments, 1)
@@ -225,7 +241,7 @@ class MarlinEncoder:
         correction_s = np.zeros(len(moves.row))
         while True:
             in_force = limits_in_force(piece, moves.row, levels.limits, levels.level)
-            feedrate, phases = self._rates(moves, begin_s, speed, correction_s, *in_force)
+            feedrate, phases = self._rates(moves, begin_s, speed, correction_s, earlier, *in_force)
             raised = levels.raise_late(phases)
             if not np.any(raised):
                 break
@@ -240,6 +256,7 @@ class MarlinEncoder:
         begin_s: float,
         speed_mm_s: NDArray[np.float64],
         correction: NDArray[np.float64],
+        earlier: float,
         limits_id: NDArray[np.int32],
         limits: Sequence[Limits],
     ) -> tuple[NDArray[np.float64], Phases]:
@@ -252,8 +269,10 @@ class MarlinEncoder:
         actual = phases.lasts_s
         at_once = self._at_once(start_mm, end_mm, path, limits_id, limits)
         blocks = Blocks(ours, steps, path, moves.end_s, moves.planned_s, fastest, at_once)
-        feedrate, predicted = np.zeros(len(ours)), np.zeros(len(ours))
-        for attempt in range(_PASSES):
+        feedrate, predicted, early_s = np.zeros((3, len(ours)))
+        best: tuple[float, NDArray[np.float64], Phases] = (np.inf, feedrate, phases)
+        for attempt in range(_DRIFT_PASSES if earlier else _PASSES):
+            blocks = blocks._replace(end_s=moves.end_s - early_s)
             assign_rates(
                 blocks,
                 actual,
@@ -270,11 +289,18 @@ class MarlinEncoder:
             phases = self._plan(start_mm, end_mm, chosen, limits_id, limits)
             actual = phases.lasts_s
             miss = actual - predicted
+            late_s = lateness_s(moves, phases)
+            off = float(np.max(np.abs(late_s) * np.where(ours, feedrate, 0.0), initial=0.0))
+            if earlier and off < best[0]:
+                best = off, feedrate.copy(), phases
             if np.max(np.abs(np.cumsum(miss)), initial=0.0) < _TIME_TOLERANCE_S:
                 break
             # Rates are quantised: a full correction would oscillate.
             correction[ours] += miss[ours] * (1.0 if attempt == 0 else 0.7)
-        return feedrate, phases
+            if earlier and attempt > 0:
+                drift_s = uniform_filter1d(late_s, _DRIFT_LINES)
+                early_s += np.where(ours, earlier * drift_s, 0.0)
+        return best[1:] if earlier else (feedrate, phases)
 
     def _advanced(self, piece: Piece, timeline: Timeline, segments: Segments) -> Segments:
         """Return segments with linear advance in their filament.

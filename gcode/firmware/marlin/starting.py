@@ -18,7 +18,7 @@ from stillpath.gcode.firmware.marlin.limits import MarlinLimits
 from stillpath.gcode.types import Phases
 from stillpath.models.machine import CommandLimits
 
-__all__ = ["StreamLevels", "gentle_accel_mm_s2"]
+__all__ = ["StreamLevels", "gentle_accel_mm_s2", "lateness_s"]
 
 _WITHIN_S = 1e-3
 """Time in which a motor can follow its speed step."""
@@ -125,13 +125,8 @@ class StreamLevels:
 
     def _behind(self, phases: Phases) -> NDArray[np.float64]:
         """Return the lag of each line's end relative to the limit, shape (n,)."""
-        ours = self._ours
-        first = ours & np.append(True, ~ours)[:-1]
-        lasts_s = phases.lasts_s
-        gained_s = np.cumsum(np.where(ours & ~first, lasts_s - self._moves.planned_s, 0.0))
-        begin = np.maximum.accumulate(np.where(first, np.arange(len(first)), 0))
         most_mm = np.where(self._feeds, _BEHIND_MM, _TRAVEL_BEHIND_MM)
-        late_s = np.where(ours, gained_s - gained_s[begin], 0.0)
+        late_s = lateness_s(self._moves, phases)
         return np.asarray(late_s * self._speed_mm_s / most_mm)
 
     def _to_stop(
@@ -159,6 +154,15 @@ class StreamLevels:
             now = int(level[i]) if self._fast[i] else max(now, int(level[i]))
             level[i] = now
         return level
+
+
+def lateness_s(moves: Interleaved, phases: Phases) -> NDArray[np.float64]:
+    """Return how late each line of a stream ends, counted from its stretch's first, shape (n,)."""
+    ours = moves.row < 0
+    first = ours & np.append(True, ~ours)[:-1]
+    begin = np.maximum.accumulate(np.where(first, np.arange(len(first)), 0))
+    passed_s = np.cumsum(np.where(ours & ~first, phases.lasts_s - moves.planned_s, 0.0))
+    return np.where(ours, passed_s - passed_s[begin], 0.0)
 
 
 def _needed(
