@@ -77,8 +77,8 @@ def test_hostile_files_at_all_routes_that_compute(tmp_path: Path) -> None:
         assert answer.status_code in (200, 422, 429), answer.text
     assert other["state"] == "done"
     assert seen.failures == []
-    assert "at most 2000 are read" in answers[0].text
-    assert "at most 2000 are read" in answers[1].text
+    assert "at most 2500 are read" in answers[0].text
+    assert "at most 2500 are read" in answers[1].text
     assert seen.largest_bytes < 300 * MIB
     assert seen.busiest_s < HELD_UP_S
     assert seen.slowest_s < STUCK_S
