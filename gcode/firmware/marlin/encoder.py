@@ -201,15 +201,16 @@ class MarlinEncoder:
         """
         own = cast(MarlinLimits, piece.limits_before)
         limits = stream_limits(own, self._command, self._mesh_slope)
-        encoded, on_time = self._with_starts(piece, timeline, segments, limits, self._start_hz)
-        if on_time:
-            return encoded
         # The motors' full acceleration is better than a late piece. Where that does not help, what
         # each corner costs adds up faster than its corrections settle.
-        encoded, on_time = self._with_starts(piece, timeline, segments, limits, np.inf)
-        if on_time:
-            return encoded
-        return self._with_starts(piece, timeline, segments, limits, np.inf, _EARLIER)[0]
+        ways = dict.fromkeys([(self._start_hz, 0.0), (np.inf, 0.0), (np.inf, _EARLIER)])
+        for least_hz, earlier in ways:
+            encoded, on_time = self._with_starts(
+                piece, timeline, segments, limits, least_hz, earlier
+            )
+            if on_time:
+                break
+        return encoded
 
     def _with_starts(
         self,
@@ -218,7 +219,7 @@ class MarlinEncoder:
         segments: Segments,
         limits: MarlinLimits,
         least_hz: float,
-        earlier: float = 0.0,
+        earlier: float,
     ) -> tuple[Encoded, bool]:
         """Encode for starts from rest at a step rate; return also whether the motion keeps up.
 
@@ -289,10 +290,11 @@ class MarlinEncoder:
             phases = self._plan(start_mm, end_mm, chosen, limits_id, limits)
             actual = phases.lasts_s
             miss = actual - predicted
-            late_s = lateness_s(moves, phases)
-            off = float(np.max(np.abs(late_s) * np.where(ours, feedrate, 0.0), initial=0.0))
-            if earlier and off < best[0]:
-                best = off, feedrate.copy(), phases
+            if earlier:
+                late_s = lateness_s(moves, phases)
+                off = float(np.max(np.abs(late_s) * np.where(ours, feedrate, 0.0), initial=0.0))
+                if off < best[0]:
+                    best = off, feedrate.copy(), phases
             if np.max(np.abs(np.cumsum(miss)), initial=0.0) < _TIME_TOLERANCE_S:
                 break
             # Rates are quantised: a full correction would oscillate.
