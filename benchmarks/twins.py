@@ -16,6 +16,7 @@ import json
 import os
 import sys
 import tempfile
+from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from multiprocessing import get_context
@@ -110,7 +111,14 @@ def main() -> int:
         files = [plain_copy(find_input(name, shared), Path(folder)) for name in given.files]
         with ProcessPoolExecutor(given.jobs, mp_context=get_context("spawn")) as pool:
             waiting = [
-                pool.submit(judged, file, name, machine, shared, options, given.cache)
+                pool.submit(
+                    judged,
+                    file,
+                    machine,
+                    {twin: twin_of(machine, name, twin, shared) for twin in ("a", "b")},
+                    options,
+                    given.cache,
+                )
                 for file in files
                 for name, machine in machines.items()
             ]
@@ -155,9 +163,9 @@ def from_tables(shipped: Machine, shared: Path) -> Machine:
 
 
 def judged(
-    file: Path, name: str, shipped: Machine, shared: Path, options: Options, cache: Path
+    file: Path, shipped: Machine, truths: Mapping[str, Machine], options: Options, cache: Path
 ) -> list[Row]:
-    """Compensate a file for a machine and let both twins print it."""
+    """Compensate a file for a machine and let its twins print it."""
     own = read_motion(file, shipped)
     with tempfile.TemporaryDirectory(prefix="stillpath-twins-") as folder:
         target = Path(folder) / "out.gcode"
@@ -165,8 +173,7 @@ def judged(
         written = read_motion(target, shipped)
     original = read_motion(file, shipped, forced_stops(own, written))
     rows = []
-    for twin in ("a", "b"):
-        truth = twin_of(shipped, name, twin, shared)
+    for twin, truth in truths.items():
         best = best_shaper(Task(file, truth.name, (), options, cache), truth, own)
         none, shaped, ours = (Judge(truth, members=False) for _ in range(3))
         for section in Own.sections(own):
