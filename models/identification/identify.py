@@ -62,7 +62,6 @@ from stillpath.models.identification.readers import (
 )
 from stillpath.models.identification.sets import (
     Origin,
-    delays_compared,
     model_file_set,
     response_set,
     spectrum_set,
@@ -78,6 +77,7 @@ from stillpath.models.identification.trust import (
     check_directions,
     check_informative,
     check_repeats,
+    delays_compared,
 )
 from stillpath.models.identification.types import (
     AccelerationLog,
