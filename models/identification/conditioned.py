@@ -32,7 +32,15 @@ from stillpath.models.schedule import (
     moving_mass_from_two_runs,
 )
 
-__all__ = ["check_labels", "of_one_test", "schedulable", "scheduled", "special", "usual"]
+__all__ = [
+    "Tested",
+    "check_labels",
+    "of_one_test",
+    "schedulable",
+    "scheduled",
+    "special",
+    "usual",
+]
 
 Tested: TypeAlias = tuple[Spectrum, Excitation, Condition]
 """A spectrum, the test that made it, and under what condition."""
