@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-__all__ = ["complaint"]
+from stillpath.models.firmware import FIRMWARE_KINDS
+
+if TYPE_CHECKING:
+    from pydantic import ValidationError
+
+__all__ = ["complaint", "explain"]
 
 _SHOWN = 80
 """Longest part of a wrong value that a message repeats."""
@@ -83,6 +88,20 @@ def complaint(entry: Mapping[str, Any], *, repeat: bool = True) -> str:
     return f"{words} (given: {text if len(text) <= _SHOWN else f'{text[:_SHOWN]}...'})"
 
 
+def explain(error: ValidationError) -> str:
+    """Return the first complaint about a document in one line, with the number of further ones."""
+    complaints = error.errors(include_url=False)
+    # Other branches of a union complain too; the deepest complaint is the relevant one.
+    first = max(complaints, key=lambda c: len(c["loc"]))
+    place = list(first["loc"])
+    if place[:1] == ["firmware"] and place[1:2] and place[1] in FIRMWARE_KINDS:
+        # The kind chooses the schema and is no part of the document's path.
+        del place[1]
+    where = ".".join(str(part) for part in place) or "document"
+    more = f"; {len(complaints) - 1} more" if len(complaints) > 1 else ""
+    return f"{where}: {complaint(first)}{more}"
+
+
 def _unit(place: tuple[int | str, ...]) -> str:
     """Return the unit that the last name of a place says, after a blank."""
     name = next((str(part) for part in reversed(place) if isinstance(part, str)), "")
@@ -90,5 +109,5 @@ def _unit(place: tuple[int | str, ...]) -> str:
 
 
 def _number(value: object) -> str:
-    """Return the shortest exact form of a number; other values unchanged."""
+    """Return a number with at most twelve digits, and the text of any other value."""
     return f"{value:.12g}" if isinstance(value, float) else str(value)

@@ -6,14 +6,29 @@ It is in this layer because both feedback designs (for stability) and simulation
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from stillpath.models.arrays import Array
+from stillpath.models.arrays import Array, Ints
 from stillpath.models.jit import kernel
 
 __all__ = ["advance"]
 
-Integers = NDArray[np.int64]
+(
+    _OUTPUT,
+    _FIRST_WIRE,
+    _END_OF_WIRES,
+    _COEFFICIENTS,
+    _ORDER,
+    _STATES,
+    _DELAY,
+    _DELAY_LINE,
+    _EVERY,
+    _PHASE,
+    _ZERO_BETWEEN,
+    _DIRECT,
+) = range(12)
+"""Columns of a layout: the fields of `models.diagrams._Row`."""
+_QUANTUM, _LIMIT = 0, 1
+"""Columns of a shape."""
 _TINY = 1e-150
 _FLUSH = 255
 
@@ -30,29 +45,34 @@ def _shaped(value: float, quantum: float, limit: float) -> float:
     return value
 
 
+@kernel(inline=True)
+def _runs(layout: Ints, b: int, now: int) -> bool:
+    """Return whether a block runs at a tick."""
+    every = layout[b, _EVERY]
+    return bool(every == 1 or now % every == layout[b, _PHASE])
+
+
 @kernel
 def advance(
-    layout: Integers,
-    wires: Integers,
+    layout: Ints,
+    wires: Ints,
     gains: Array,
     num: Array,
     den: Array,
     shape: Array,
     state: Array,
-    cursor: Integers,
+    cursor: Ints,
     signals: Array,
     tick: int,
-    sources: Integers,
+    sources: Ints,
     inputs: Array,
-    watched: Integers,
+    watched: Ints,
     records: Array,
 ) -> None:
     """Run a diagram for as many ticks as `inputs` has columns.
 
-    `layout` has a row per block: output signal, first and last wire, first coefficient, order,
-    first state, delay, first place of the delay line, ticks between runs, phase, zero between
-    runs, needs its input at once. `shape` has rows (quantum, limit). `state` holds the states of
-    all filters, then all delay lines; `cursor` the place of the oldest sample of each line.
+    `layout` has a row per block, `shape` its quantum and limit. `state` holds the states of all
+    filters, then all delay lines; `cursor` the place of the oldest sample of each line.
 
     A tick has three passes: blocks without direct feedthrough write their output, then the others
     run in order, and finally the first ones read their inputs.
@@ -64,38 +84,37 @@ def advance(
         for i in range(len(sources)):
             signals[sources[i]] = inputs[i, k]
         for b in range(blocks):
-            if layout[b, 11] == 0 and (layout[b, 8] == 1 or now % layout[b, 8] == layout[b, 9]):
-                value = state[layout[b, 5]] if layout[b, 4] > 0 else 0.0
-                if layout[b, 6] > 0:
-                    value += num[layout[b, 3]] * state[layout[b, 7] + cursor[b]]
+            if layout[b, _DIRECT] == 0 and _runs(layout, b, now):
+                value = state[layout[b, _STATES]] if layout[b, _ORDER] > 0 else 0.0
+                if layout[b, _DELAY] > 0:
+                    oldest = state[layout[b, _DELAY_LINE] + cursor[b]]
+                    value += num[layout[b, _COEFFICIENTS]] * oldest
                 memory[b] = value
-                signals[layout[b, 0]] = _shaped(value, shape[b, 0], shape[b, 1])
-            elif layout[b, 10] == 1:
-                signals[layout[b, 0]] = 0.0
+                signals[layout[b, _OUTPUT]] = _shaped(value, shape[b, _QUANTUM], shape[b, _LIMIT])
+            elif layout[b, _ZERO_BETWEEN] == 1:
+                signals[layout[b, _OUTPUT]] = 0.0
         for step in range(2):
             for b in range(blocks):
-                if layout[b, 11] != 1 - step or (
-                    layout[b, 8] != 1 and now % layout[b, 8] != layout[b, 9]
-                ):
+                if layout[b, _DIRECT] != 1 - step or not _runs(layout, b, now):
                     continue
                 x = 0.0
-                for w in range(layout[b, 1], layout[b, 2]):
+                for w in range(layout[b, _FIRST_WIRE], layout[b, _END_OF_WIRES]):
                     x += gains[w] * signals[wires[w]]
-                order, first = layout[b, 4], layout[b, 5]
-                c = layout[b, 3]
+                order, first = layout[b, _ORDER], layout[b, _STATES]
+                c = layout[b, _COEFFICIENTS]
                 if step == 0:
                     y = num[c] * x
                     if order > 0:
                         y += state[first]
-                    signals[layout[b, 0]] = _shaped(y, shape[b, 0], shape[b, 1])
+                    signals[layout[b, _OUTPUT]] = _shaped(y, shape[b, _QUANTUM], shape[b, _LIMIT])
                 else:
                     y = memory[b]
-                    if layout[b, 6] > 0:
-                        place = layout[b, 7] + cursor[b]
+                    if layout[b, _DELAY] > 0:
+                        place = layout[b, _DELAY_LINE] + cursor[b]
                         oldest = state[place]
                         state[place] = x
                         x = oldest
-                        cursor[b] = (cursor[b] + 1) % layout[b, 6]
+                        cursor[b] = (cursor[b] + 1) % layout[b, _DELAY]
                 # Direct form II, transposed.
                 for i in range(order - 1):
                     state[first + i] = (

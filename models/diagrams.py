@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -155,6 +156,37 @@ class Diagram:
         return np.asarray(np.linalg.solve(system, drive)[:, place[target], 0], complex)
 
 
+class _Row(NamedTuple):
+    """Where a block's numbers lie in the arrays of the kernel, and how it runs.
+
+    The order is that of the columns which `diagram_kernels` reads.
+
+    Attributes
+    ----------
+    output : int
+        Signal that it writes.
+    first_wire, end_of_wires : int
+        Its inputs among all wires and gains.
+    coefficients : int
+        First of its order + 1 numbers in numerators and denominators.
+    states, delay_line : int
+        First of its `order` states, and of its `delay` places, among all states.
+    """
+
+    output: int
+    first_wire: int
+    end_of_wires: int
+    coefficients: int
+    order: int
+    states: int
+    delay: int
+    delay_line: int
+    every: int
+    phase: int
+    zero_between: bool
+    direct: bool
+
+
 class Running:
     """A running diagram with its states; `push` continues where the last call ended.
 
@@ -225,14 +257,14 @@ class Running:
             at = [i for i, b in enumerate(self.diagram.blocks) if b.output == new.output]
             if len(at) != 1 or _frame(self.diagram.blocks[at[0]]) != _frame(new):
                 raise ModelError(f"block {new.output!r} does not fit what it should replace")
-            row = self._layout[at[0]]
-            first, order = int(row[3]), int(row[4])
-            self._num[first : first + order + 1] = _padded(new.num, order) / new.den[0]
-            self._den[first : first + order + 1] = _padded(new.den, order) / new.den[0]
-            self._gains[row[1] : row[2]] = [gain for _, gain in new.inputs]
+            row = self._rows[at[0]]
+            its = slice(row.coefficients, row.coefficients + row.order + 1)
+            self._num[its] = _padded(new.num, row.order) / new.den[0]
+            self._den[its] = _padded(new.den, row.order) / new.den[0]
+            self._gains[row.first_wire : row.end_of_wires] = [gain for _, gain in new.inputs]
             if reset:
-                self._state[row[5] : row[5] + order] = 0.0
-                self._state[row[7] : row[7] + row[6]] = 0.0
+                self._state[row.states : row.states + row.order] = 0.0
+                self._state[row.delay_line : row.delay_line + row.delay] = 0.0
 
     @property
     def size(self) -> int:
@@ -253,8 +285,8 @@ class Running:
         ticks = self.diagram.period
         self._advance(nothing, np.zeros((0, ticks)), nothing, np.zeros((0, ticks)))
         after = self._state.copy()
-        for row, turn in zip(self._layout, self._cursor, strict=True):
-            line = slice(row[7], row[7] + row[6])
+        for row, turn in zip(self._rows, self._cursor, strict=True):
+            line = slice(row.delay_line, row.delay_line + row.delay)
             after[line] = np.roll(after[line], -turn)
         return np.concatenate([after, self._signals[self._held]])
 
@@ -286,19 +318,28 @@ class Running:
         self._shape = np.array([[b.quantum, b.limit] for b in blocks])
         wire = coefficient = state = 0
         line = sum(b.order for b in blocks)
-        rows = []
+        self._rows: list[_Row] = []
         for b in blocks:
-            rows.append(
-                (
-                    *(self._place[b.output], wire, wire + len(b.inputs), coefficient, b.order),
-                    *(state, b.delay, line, b.every, b.phase, b.zero_between, b.direct),
-                )
+            row = _Row(
+                output=self._place[b.output],
+                first_wire=wire,
+                end_of_wires=wire + len(b.inputs),
+                coefficients=coefficient,
+                order=b.order,
+                states=state,
+                delay=b.delay,
+                delay_line=line,
+                every=b.every,
+                phase=b.phase,
+                zero_between=b.zero_between,
+                direct=b.direct,
             )
-            wire += len(b.inputs)
+            self._rows.append(row)
+            wire = row.end_of_wires
             coefficient += b.order + 1
             state += b.order
             line += b.delay
-        self._layout = np.array(rows, np.int64)
+        self._layout = np.array(self._rows, np.int64)
         self._states = line
         held = dict.fromkeys(self._place[b.output] for b in blocks if b.every > 1)
         self._held = np.array(list(held), np.int64)

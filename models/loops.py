@@ -11,7 +11,6 @@ c, which an add-on controller takes off the control: u = v - c.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -23,10 +22,12 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, ValidationError
 
 from stillpath.models.arrays import Complex
+from stillpath.models.complaints import explain
 from stillpath.models.diagrams import Block, polynomial_response
 from stillpath.models.disturbances import SensorSpec
 from stillpath.models.document import Document, Finite, Positive
 from stillpath.models.errors import ModelError
+from stillpath.models.user_files import as_json, names_a_file, read_bytes
 
 __all__ = [
     "Loop",
@@ -42,6 +43,7 @@ __all__ = [
 Coefficients = tuple[float, ...]
 Polynomial = Annotated[tuple[Finite, ...], Field(min_length=1, max_length=64)]
 _LIBRARY = Path(__file__).parent / "library_loops"
+_LARGEST_BYTES = 4_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -402,7 +404,7 @@ def load_loop(name_or_path: str | Path) -> LoopSpec:
         If there is none, or the document is not valid.
     """
     text = str(name_or_path)
-    if isinstance(name_or_path, Path) or text.endswith(".json") or "/" in text:
+    if isinstance(name_or_path, Path) or names_a_file(text):
         path = Path(name_or_path)
     elif text in builtin_loops():
         path = _LIBRARY / f"{text}.json"
@@ -411,10 +413,7 @@ def load_loop(name_or_path: str | Path) -> LoopSpec:
             f"no closed-loop machine is called {text!r}; built in are "
             f"{', '.join(builtin_loops())}; a file of your own is given by its path"
         )
-    try:
-        return read_loop(path.read_bytes(), str(path))
-    except OSError as error:
-        raise ModelError(f"cannot read {path}: {error.strerror}") from None
+    return read_loop(read_bytes(path, _LARGEST_BYTES, "not a closed-loop machine"), str(path))
 
 
 def read_loop(document: str | bytes, source: str = "loop") -> LoopSpec:
@@ -425,14 +424,11 @@ def read_loop(document: str | bytes, source: str = "loop") -> LoopSpec:
     ModelError
         Naming the field that is wrong.
     """
+    parsed = as_json(document.encode() if isinstance(document, str) else document, source)
     try:
-        spec = LoopSpec.model_validate(json.loads(document))
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise ModelError(f"{source}: not JSON ({error})") from None
+        spec = LoopSpec.model_validate(parsed)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise ModelError(f"{source}: {where}: {first['msg']}") from None
+        raise ModelError(f"{source}: {explain(error)}") from None
     spec.loops()
     return spec
 

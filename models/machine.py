@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, Field, model_validator
 
@@ -35,6 +35,23 @@ _Part = TypeVar("_Part", bound=Document)
 
 _FASTEST_MM_S, _STRONGEST_MM_S2 = 1e5, 1e7
 """Ten times what the fastest machines reach; with far larger limits no motion can be computed."""
+
+_ADDED: dict[tuple[str, ...], dict[str, Any]] = {
+    (): {"schedules": {}, "ripple": {}, "confirmations": {}},
+    ("command",): {"axes": {}, "motors": None},
+    ("axes", "*"): {"friction_mm": None},
+    ("axes", "*", "provenance"): dict.fromkeys(ADDED),
+    ("firmware",): {
+        "ft_motion": False,
+        "ft_motion_version": 2,
+        "macros": [],
+        "arc_circles": False,
+        "limits_capped": False,
+    },
+    ("firmware", "planner"): {"max_accel_to_decel_mm_s2": None},
+}
+"""Fields that older documents lack, by place, with the value that says nothing new: where they have
+it, they are left out of the revision, so that machines from before them keep theirs."""
 
 
 def _up_to(most: float, unit: str) -> AfterValidator:
@@ -139,6 +156,15 @@ class CommandLimits(Document):
         return _multiplied(self, ratios).model_copy(update={"axes": axes, "motors": motors})
 
 
+def _parts(content: dict[str, Any], place: tuple[str, ...]) -> list[dict[str, Any]]:
+    """Return the objects at a place of a JSON document; ``*`` is any name, null is no object."""
+    parts = [content]
+    for name in place:
+        found = [value for part in parts for key, value in part.items() if name in (key, "*")]
+        parts = [value for value in found if value is not None]
+    return parts
+
+
 def _multiplied(document: _Part, ratios: dict[str, float]) -> _Part:
     given = {name: getattr(document, name) for name in ratios}
     return document.model_copy(
@@ -196,31 +222,11 @@ class Machine(Document):
     def revision(self) -> str:
         """First 12 hex digits of the SHA-256 of the canonical JSON document."""
         content = self.model_dump(mode="json")
-        for added in ("schedules", "ripple", "confirmations"):
-            if not content[added]:
-                # Machines from before there were such fields keep their revision.
-                del content[added]
-        for added in ("axes", "motors"):
-            if not content["command"][added]:
-                del content["command"][added]
-        for axis in content["axes"].values():
-            if axis["friction_mm"] is None:
-                del axis["friction_mm"]
-            about = axis["provenance"] or {}
-            for added in ADDED:
-                if about.get(added, ...) is None:
-                    del about[added]
-        if not content["firmware"].get("ft_motion", True):
-            del content["firmware"]["ft_motion"]
-        if not content["firmware"].get("macros", True):
-            del content["firmware"]["macros"]
-        if content["firmware"].get("planner", {}).get("max_accel_to_decel_mm_s2", ...) is None:
-            del content["firmware"]["planner"]["max_accel_to_decel_mm_s2"]
-        for added in ("arc_circles", "limits_capped"):
-            if not content["firmware"].get(added, True):
-                del content["firmware"][added]
-        if content["firmware"].get("ft_motion_version") == 2:
-            del content["firmware"]["ft_motion_version"]
+        for place, added in _ADDED.items():
+            for part in _parts(content, place):
+                for name, before in added.items():
+                    if name in part and part[name] == before:
+                        del part[name]
         document = json.dumps(content, sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(document.encode()).hexdigest()[:12]
 

@@ -21,7 +21,7 @@ Phase: TypeAlias = Literal["not measured", "aligned at low frequency"]
 is measured is phase relative to slow motion, which is taken to be on time."""
 
 ADDED = ("phase", "slow_delay_s", "coherent_share", "coherent_band_hz", "friction")
-"""Fields that older documents lack: where they are None, a document is as it was before them."""
+"""Fields that older documents lack; None says nothing new (`models.machine.Machine.revision`)."""
 
 
 class SourceFile(Document):

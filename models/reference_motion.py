@@ -100,13 +100,35 @@ def _circle(radius: float) -> Array:
 
 
 def _drive(line: Array, speed_mm_s: float, accel_mm_s2: float, dt_s: float) -> Array:
-    """Sample a polyline: speed trapezoids from corner to corner, 5 mm/s at sharp corners."""
+    """Sample a polyline (2, n), driven from rest to rest: at least once, the last time at its end.
+
+    A line without length has no samples.
+    """
     step = np.diff(line, axis=1)
     length = np.hypot(step[0], step[1])
     keep = length > 1e-9
     if not keep.any():
         return np.zeros((2, 0))
     step, length = step[:, keep], length[keep]
+    corners = _corner_speeds(step, length, speed_mm_s, accel_mm_s2)
+    times, along, speeds = _knots(length, corners, speed_mm_s, accel_mm_s2)
+    # At least one sample beyond the end, so that the last one is at the end point.
+    t = np.arange(1, math.ceil(times[-1] / dt_s) + 1) * dt_s
+    knot = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 2)
+    into = np.minimum(t, times[-1]) - times[knot]
+    rate = (speeds[knot + 1] - speeds[knot]) / np.diff(times)[knot]
+    s = along[knot] + speeds[knot] * into + rate * into * into / 2
+    ends = np.concatenate([[0.0], np.cumsum(length)])
+    start = line[:, :1]
+    vertices = np.hstack([start, start + np.cumsum(step, axis=1)])
+    return np.vstack([np.interp(s, ends, row) for row in vertices])
+
+
+def _corner_speeds(step: Array, length: Array, speed_mm_s: float, accel_mm_s2: float) -> Array:
+    """Return the speed at every vertex of lines (2, n), shape (n + 1,): 0 at both ends.
+
+    Each is reached from its neighbours within the acceleration.
+    """
     heading = step / length
     turn = np.sum(heading[:, 1:] * heading[:, :-1], axis=0)
     # Corners of a circle's polygon are no corners; they are taken at the speed that the
@@ -116,31 +138,28 @@ def _drive(line: Array, speed_mm_s: float, accel_mm_s2: float, dt_s: float) -> A
     curve = np.sqrt(accel_mm_s2 * np.minimum(length[1:], length[:-1]) / swing)
     limit = np.where(gentle, np.minimum(speed_mm_s, curve), _CORNER_MM_S)
     corner = np.concatenate([[0.0], limit, [0.0]])
-    for order in (range(len(length)), range(len(length) - 1, -1, -1)):
-        forward = order.step == 1
-        for i in order:
-            a, b = (i, i + 1) if forward else (i + 1, i)
-            corner[b] = min(corner[b], math.sqrt(corner[a] ** 2 + 2 * accel_mm_s2 * length[i]))
-    start = line[:, 0]
-    times, along = [0.0], [0.0]
-    speeds = [0.0]
-    for i, size in enumerate(length):
-        v0, v1 = corner[i], corner[i + 1]
-        top = min(speed_mm_s, math.sqrt((v0 * v0 + v1 * v1) / 2 + accel_mm_s2 * float(size)))
+    lines = range(len(length))
+    ahead, back = [(i, i, i + 1) for i in lines], [(i, i + 1, i) for i in reversed(lines)]
+    for i, a, b in (*ahead, *back):
+        corner[b] = min(corner[b], math.sqrt(corner[a] ** 2 + 2 * accel_mm_s2 * length[i]))
+    return corner
+
+
+def _knots(
+    length: Array, corners: Array, speed_mm_s: float, accel_mm_s2: float
+) -> tuple[Array, Array, Array]:
+    """Return time, way and speed of every knot between constant accelerations, shape (n,) each.
+
+    Each line has a trapezoid of speed: up from its first corner, along, and down to its last.
+    """
+    times, along, speeds = [0.0], [0.0], [0.0]
+    for size, v0, v1 in zip(length.tolist(), corners[:-1], corners[1:], strict=True):
+        top = min(speed_mm_s, math.sqrt((v0 * v0 + v1 * v1) / 2 + accel_mm_s2 * size))
         up, down = (top * top - v0 * v0) / 2, (top * top - v1 * v1) / 2
-        cruise = max(float(size) - (up + down) / accel_mm_s2, 0.0)
+        cruise = max(size - (up + down) / accel_mm_s2, 0.0)
         for distance, v in ((up / accel_mm_s2, top), (cruise, top), (down / accel_mm_s2, v1)):
             if distance > 1e-12:
                 times.append(times[-1] + 2 * distance / (speeds[-1] + v))
                 along.append(along[-1] + distance)
                 speeds.append(v)
-    # At least one sample beyond the end, so that the last one is at the end point.
-    t = np.arange(1, math.ceil(times[-1] / dt_s) + 1) * dt_s
-    knot = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 2)
-    into = np.minimum(t, times[-1]) - np.array(times)[knot]
-    v = np.array(speeds)
-    rate = (v[knot + 1] - v[knot]) / np.diff(times)[knot]
-    s = np.array(along)[knot] + v[knot] * into + rate * into * into / 2
-    ends = np.concatenate([[0.0], np.cumsum(length)])
-    vertices = np.hstack([start[:, None], start[:, None] + np.cumsum(step, axis=1)])
-    return np.vstack([np.interp(s, ends, row) for row in vertices])
+    return np.array(times), np.array(along), np.array(speeds)

@@ -9,20 +9,12 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from stillpath.models.complaints import complaint
+from stillpath.models.complaints import explain
 from stillpath.models.errors import ModelError
-from stillpath.models.firmware import FIRMWARE_KINDS
 from stillpath.models.machine import Machine
-from stillpath.models.user_files import as_json
+from stillpath.models.user_files import as_json, names_a_file
 
-__all__ = [
-    "builtin_machines",
-    "explain",
-    "load_machine",
-    "names_a_file",
-    "no_such_machine",
-    "read_machine",
-]
+__all__ = ["builtin_machines", "load_machine", "no_such_machine", "read_machine"]
 
 _LIBRARY = Path(__file__).parent / "library"
 _LARGEST_BYTES = 4_000_000
@@ -49,11 +41,6 @@ def load_machine(name_or_path: str | Path) -> Machine:
     if text not in _builtin_names():
         raise no_such_machine(text)
     return _builtin(text)
-
-
-def names_a_file(text: str) -> bool:
-    """Return whether `text` is the path of a file rather than a machine's name."""
-    return text.lower().endswith(".json") or "/" in text or "\\" in text
 
 
 def no_such_machine(name: str, own: Sequence[str] = (), *, files: bool = True) -> ModelError:
@@ -85,20 +72,6 @@ def read_machine(document: str | bytes, source: str = "machine") -> Machine:
         return Machine.model_validate(parsed)
     except ValidationError as error:
         raise ModelError(f"{source}: {explain(error)}") from None
-
-
-def explain(error: ValidationError) -> str:
-    """Return the first complaint about a document in one line, with the number of further ones."""
-    complaints = error.errors(include_url=False)
-    # Other branches of a union complain too; the deepest complaint is the relevant one.
-    first = max(complaints, key=lambda c: len(c["loc"]))
-    place = list(first["loc"])
-    if place[:1] == ["firmware"] and place[1:2] and place[1] in FIRMWARE_KINDS:
-        # The kind chooses the schema and is no part of the document's path.
-        del place[1]
-    where = ".".join(str(part) for part in place) or "document"
-    more = f"; {len(complaints) - 1} more" if len(complaints) > 1 else ""
-    return f"{where}: {complaint(first)}{more}"
 
 
 # What comes with the program does not change while it runs, and every upload asks for it.

@@ -11,7 +11,12 @@ from pydantic_core import from_json
 
 from stillpath.models.errors import ModelError
 
-__all__ = ["as_json", "as_utf8", "read_bytes"]
+__all__ = ["as_json", "as_utf8", "names_a_file", "read_bytes"]
+
+
+def names_a_file(text: str) -> bool:
+    """Return whether `text` is the path of a file rather than a name of ours."""
+    return text.lower().endswith(".json") or "/" in text or "\\" in text
 
 
 def read_bytes(path: Path, largest: int, otherwise: str) -> bytes:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pydantic import ValidationError
 
 from stillpath.applications.identification.run import LARGEST_BYTES, InputFile, read_inputs
+from stillpath.models.complaints import explain
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.readers.compressed import unpacked
 from stillpath.models.identification.readers.tables import check_size
@@ -16,7 +17,6 @@ from stillpath.models.identification.ripple_passes import learn_machine_ripple, 
 from stillpath.models.machine import Machine
 from stillpath.models.provenance import SourceFile
 from stillpath.models.ripple import RippleAxis, RippleSide
-from stillpath.models.store import explain
 from stillpath.models.user_files import as_utf8
 
 __all__ = ["LearntRipple", "learn_from_files", "parse_basis"]

@@ -13,6 +13,7 @@ from pydantic import ValidationError
 
 from stillpath.applications.identification.figures import IdentificationReport
 from stillpath.applications.identification.report import identification_report
+from stillpath.models.complaints import explain
 from stillpath.models.errors import ModelError
 from stillpath.models.friction import usual_guides
 from stillpath.models.identification.conditioned import schedulable
@@ -24,7 +25,6 @@ from stillpath.models.machine import Machine
 from stillpath.models.plants import PlantSpec, discretise
 from stillpath.models.provenance import SourceFile
 from stillpath.models.schedule import AxisSchedule, MassSchedule, resonances_hz
-from stillpath.models.store import explain
 from stillpath.models.user_files import read_bytes
 
 __all__ = ["Identified", "InputFile", "identify_files", "read_inputs"]

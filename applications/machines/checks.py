@@ -10,11 +10,11 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from stillpath.applications.machines.klipper_config import Fact, PrinterConfig, facts
+from stillpath.models.complaints import explain
 from stillpath.models.errors import ModelError
 from stillpath.models.firmware import Klipper
 from stillpath.models.firmware.common import AxisAllowance
 from stillpath.models.machine import AxisLimits, CommandLimits, Machine, MotorLimits
-from stillpath.models.store import explain
 from stillpath.models.typed_in import typed_in
 
 __all__ = [

@@ -16,9 +16,9 @@ from stillpath.applications.machines.checks import (
     stated_axis,
     with_firmware,
 )
+from stillpath.models.complaints import explain
 from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
-from stillpath.models.store import explain
 
 __all__ = [
     "ASSUMED",

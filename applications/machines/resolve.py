@@ -15,12 +15,8 @@ from stillpath.applications.machines.store import MachineStore
 from stillpath.models.document import Document
 from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
-from stillpath.models.store import (
-    builtin_machines,
-    load_machine,
-    names_a_file,
-    no_such_machine,
-)
+from stillpath.models.store import builtin_machines, load_machine, no_such_machine
+from stillpath.models.user_files import names_a_file
 
 __all__ = ["PinnedMachine", "Resolver"]
 

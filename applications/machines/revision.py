@@ -15,11 +15,11 @@ from pydantic import (
     model_validator,
 )
 
+from stillpath.models.complaints import explain
 from stillpath.models.document import Document
 from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
 from stillpath.models.provenance import SourceFile
-from stillpath.models.store import explain
 
 __all__ = [
     "Approval",

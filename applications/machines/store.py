@@ -31,11 +31,12 @@ from stillpath.applications.machines.revision import (
     UnknownMachine,
     document_text,
 )
+from stillpath.models.complaints import explain
 from stillpath.models.confirmation import Confirmation
 from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
 from stillpath.models.provenance import SourceFile
-from stillpath.models.store import builtin_machines, explain
+from stillpath.models.store import builtin_machines
 
 __all__ = ["MachineStore", "check_name"]
 

@@ -17,11 +17,12 @@ from stillpath.applications.machines.revision import (
     source_file,
 )
 from stillpath.applications.machines.store import MachineStore
+from stillpath.models.complaints import explain
 from stillpath.models.document import Document
 from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
 from stillpath.models.provenance import SourceFile
-from stillpath.models.store import explain, read_machine
+from stillpath.models.store import read_machine
 from stillpath.models.user_files import as_json, as_utf8, read_bytes
 
 __all__ = ["export_history", "import_file", "with_firmware_file"]

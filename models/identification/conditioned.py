@@ -10,6 +10,7 @@ from typing import TypeAlias
 
 from pydantic import ValidationError
 
+from stillpath.models.complaints import explain
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.conditions import Condition
 from stillpath.models.identification.prompt import prompt
@@ -30,9 +31,16 @@ from stillpath.models.schedule import (
     MassSchedule,
     moving_mass_from_two_runs,
 )
-from stillpath.models.store import explain
 
-__all__ = ["check_labels", "of_one_test", "schedulable", "scheduled", "special", "usual"]
+__all__ = [
+    "Tested",
+    "check_labels",
+    "of_one_test",
+    "schedulable",
+    "scheduled",
+    "special",
+    "usual",
+]
 
 Tested: TypeAlias = tuple[Spectrum, Excitation, Condition]
 """A spectrum, the test that made it, and under what condition."""

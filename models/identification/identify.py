@@ -11,14 +11,11 @@ from dataclasses import dataclass, field, replace
 from typing import TypeAlias
 
 from stillpath.models.errors import ModelError
-from stillpath.models.identification.alignment import (
-    AlignedLog,
-    align,
-    spectrum_along,
-)
+from stillpath.models.identification.alignment import AlignedLog, align, spectrum_along
 from stillpath.models.identification.averaging import mean_response, mean_spectrum
 from stillpath.models.identification.clocks import Lateness, lateness, timed
 from stillpath.models.identification.conditioned import (
+    Tested,
     check_labels,
     of_one_test,
     scheduled,
@@ -37,7 +34,7 @@ from stillpath.models.identification.messages import (
     body_notes,
     by_file,
     fit_warnings,
-    frame_mode_notes,
+    frame_mode_warnings,
     friction_notes,
     level_warnings,
     mounting_notes,
@@ -62,7 +59,6 @@ from stillpath.models.identification.readers import (
 )
 from stillpath.models.identification.sets import (
     Origin,
-    delays_compared,
     model_file_set,
     response_set,
     spectrum_set,
@@ -78,6 +74,7 @@ from stillpath.models.identification.trust import (
     check_directions,
     check_informative,
     check_repeats,
+    delays_compared,
 )
 from stillpath.models.identification.types import (
     AccelerationLog,
@@ -154,7 +151,7 @@ def identify(
         axis: _AxisWork(axis, groups[axis], settings, sources, max_order, steps)
         for axis in sorted(groups)
     }
-    frames_hz = {axis: work.frame_hz() for axis, work in works.items()}
+    frames_hz = {axis: work.explain_spectra() for axis, work in works.items()}
     frame_likely = 0.0 if settings.frame_firm else likely_of(frames_hz.values())
     found = {axis: work.identified(frame_likely) for axis, work in works.items()}
     if 0.0 < frame_likely < LIKELY:
@@ -207,7 +204,7 @@ class _AxisWork:
         """By how much friction made alignment place the starts of the tests too late."""
         self.late: list[Lateness] = []
         """Of the raw logs that led to plants with their phase."""
-        self._spectra: list[tuple[Spectrum, Excitation, Condition]] = []
+        self._spectra: list[Tested] = []
         self._explanations: Explanations | None = None
         kind = next(k for k in _BEST_FIRST if any(isinstance(m.measurement, k) for m in measured))
         self._used = [m for m in measured if isinstance(m.measurement, kind)]
@@ -219,8 +216,8 @@ class _AxisWork:
             measured_on=max(filter(None, map(date_in_name, names)), default=None),
         )
 
-    def frame_hz(self) -> float | None:
-        """Return the frequency of a weak mode in spectra that may be the frame's; else None."""
+    def explain_spectra(self) -> float | None:
+        """Find what explains spectra; return the frequency of what may be the frame's mode."""
         if self._kind != "spectrum":
             return None
         self._spectra = [self._spectrum(one) for one in self._used]
@@ -230,7 +227,7 @@ class _AxisWork:
         return self._explanations.frame_hz
 
     def identified(self, frame_likely: float) -> AxisIdentification:
-        """Return the axis with the notes of its files.
+        """Return the axis with the notes of its files; `explain_spectra` comes first.
 
         Parameters
         ----------
@@ -309,7 +306,6 @@ class _AxisWork:
         }
         others = tuple(r for r, c in responses if c not in common)
         notes: list[str] = []
-        left_out = frame_mode_notes(prompt(nominal), found.plants.nominal)
         if self._kind == "raw log":
             warnings = level_warnings(chosen, nominal)
             mounting = [] if self._settings.sensor_axis else mounting_notes(self._axis, chosen)
@@ -318,16 +314,17 @@ class _AxisWork:
             self.late = self._lateness(at, chosen, prompt(nominal), found.plants)
         else:
             warnings = scale_warnings(chosen, nominal)
+        warnings += frame_mode_warnings(prompt(nominal), found.plants.nominal)
         found = replace(
             found,
             plants=self._rubbing(found.plants),
             measured=(*found.measured, *others),
-            warnings=(*found.warnings, *warnings, *left_out),
+            warnings=(*found.warnings, *warnings),
             notes=tuple(notes),
         )
         return scheduled(found, nominal, fits, self._kind)
 
-    def _spectrum(self, one: Measured) -> tuple[Spectrum, Excitation, Condition]:
+    def _spectrum(self, one: Measured) -> Tested:
         spectrum = one.measurement
         assert isinstance(spectrum, Spectrum)
         self._steps.stepped(f"axis {self._axis}: {spectrum.source}")

@@ -30,7 +30,7 @@ __all__ = [
     "by_file",
     "cross_axis_warning",
     "fit_warnings",
-    "frame_mode_notes",
+    "frame_mode_warnings",
     "friction_notes",
     "level_warnings",
     "mounting_notes",
@@ -137,8 +137,8 @@ def friction_notes(plants: PlantSetSpec, guides: Guides | None) -> list[str]:
     return [note]
 
 
-def frame_mode_notes(felt: PlantSpec, kept: PlantSpec, *, table: bool = False) -> list[str]:
-    """Say which modes of a log, or of a table, are left out as the frame's."""
+def frame_mode_warnings(felt: PlantSpec, kept: PlantSpec, *, table: bool = False) -> list[str]:
+    """Warn of modes of a log, or of a table, that are left out as the frame's."""
     known_hz = _modes_hz(kept)
     left_out = [f"{f_hz:.1f} Hz" for f_hz in _modes_hz(felt) if f_hz not in known_hz]
     if not left_out:

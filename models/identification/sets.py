@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import date
 
 import numpy as np
@@ -24,9 +24,7 @@ from stillpath.models.identification.prompt import delay_of, prompt
 from stillpath.models.identification.response_bootstrap import explain_response
 from stillpath.models.identification.response_data import coherent_part
 from stillpath.models.identification.spectrum_fit import Explanations
-from stillpath.models.identification.trust import keeps_time
 from stillpath.models.identification.types import (
-    Axis,
     AxisIdentification,
     Fit,
     FrequencyResponse,
@@ -42,20 +40,16 @@ from stillpath.models.plants import (
 from stillpath.models.provenance import Kind, MeasuredMode, Provenance, SourceFile
 
 __all__ = [
-    "PARAMETRIC_SPREAD",
     "Origin",
-    "delay_warning",
-    "delays_compared",
     "measured_modes",
     "model_file_set",
     "parametric_members",
     "plant_set_from",
-    "provenance_of",
     "response_set",
     "spectrum_set",
 ]
 
-PARAMETRIC_SPREAD: dict[str, tuple[float, float]] = {
+_PARAMETRIC_SPREAD: dict[Kind, tuple[float, float]] = {
     "raw log": (0.02, 0.20),
     "frequency response": (0.02, 0.20),
     "recorded drive": (0.02, 0.20),
@@ -87,7 +81,6 @@ _FEW_REPEATS = 1.25
 _NO_MIDDLE = 1.05
 """Ratio of resonances under different labels from which their mean is the response of no plant."""
 _POINTS = 200
-_DELAYS_DIFFER_S = 0.2e-3
 _MOST_GROUNDED = 0.5
 """Largest share of the damping that may act against the frame (viscous guides)."""
 
@@ -141,15 +134,16 @@ def response_set(
             nominal=population.members[0],
             members=_weighted(population.members, population.weights),
             band_hz=fit.band_hz,
-            provenance=provenance_of(fit, kind, measured, delays_s=delays_s, origin=origin),
+            provenance=_provenance_of(fit, kind, measured, delays_s=delays_s, origin=origin),
         )
+    names = [mean.label or mean.source for mean in means]
     return AxisIdentification(
         axis=axis,
         plants=plants,
         fit=fit,
         measured=tuple(measured),
         member_fits=tuple(kept),
-        warnings=(*fit.notes, *_set_notes([m.label or m.source for m in means], fits, kept, fit)),
+        warnings=(*fit.notes, *_set_warnings(names, fits, kept, fit)),
     )
 
 
@@ -177,7 +171,7 @@ def spectrum_set(
         nominal=fit.spec,
         members=_weighted(members, population.weights),
         band_hz=fit.band_hz,
-        provenance=provenance_of(
+        provenance=_provenance_of(
             fit,
             "spectrum",
             delays_s=_span([plant.delay_s for plant in members]),
@@ -210,7 +204,7 @@ def plant_set_from(
 ) -> PlantSetSpec:
     """Return the set of a nominal fit and the fits of its members.
 
-    Without members the nominal plant is varied by `PARAMETRIC_SPREAD`.
+    Without members the nominal plant is varied by its typical spread (`parametric_members`).
     """
     listed: tuple[WeightedMember, ...] | ParametricMembers = parametric_members(kind)
     if members:
@@ -221,7 +215,7 @@ def plant_set_from(
         nominal=prompt(fit),
         members=listed,
         band_hz=fit.band_hz,
-        provenance=provenance_of(fit, kind, delays_s=delays_s, origin=origin),
+        provenance=_provenance_of(fit, kind, delays_s=delays_s, origin=origin),
     )
 
 
@@ -242,11 +236,42 @@ def model_file_set(spec: PlantSpec) -> PlantSetSpec:
 
 def parametric_members(kind: Kind) -> ParametricMembers:
     """Return the corners, sides and centre of the spread that `kind` of measurement has."""
-    f, z = PARAMETRIC_SPREAD[kind]
+    f, z = _PARAMETRIC_SPREAD[kind]
     return ParametricMembers(frequency_scale=(1 - f, 1.0, 1 + f), damping_scale=(1 - z, 1.0, 1 + z))
 
 
-def provenance_of(
+def measured_modes(fit: Fit) -> tuple[MeasuredMode, ...]:
+    """Return the modes of a fit as in documents, without unknown figures."""
+    return tuple(
+        MeasuredMode(
+            f_hz=m.f_hz,
+            zeta=m.zeta,
+            f_sd_hz=m.f_sd_hz if np.isfinite(m.f_sd_hz) else None,
+            zeta_sd=m.zeta_sd if np.isfinite(m.zeta_sd) else None,
+        )
+        for m in fit.modes
+    )
+
+
+def _by_label(measured: Sequence[FrequencyResponse], axis: str) -> list[list[FrequencyResponse]]:
+    if not measured:
+        raise ModelError(f"axis {axis}: no frequency response to identify from; give one or more")
+    groups: dict[str, list[FrequencyResponse]] = {}
+    for response in measured:
+        groups.setdefault(response.label, []).append(response)
+    return list(groups.values())
+
+
+def _parts(
+    progress: Callable[[float], None] | None,
+) -> tuple[Callable[[float], None] | None, Callable[[float], None] | None]:
+    """Part progress between a fit and the draws after it."""
+    if progress is None:
+        return None, None
+    return lambda part: progress(0.5 * part), lambda part: progress(0.5 + 0.5 * part)
+
+
+def _provenance_of(
     fit: Fit,
     kind: Kind,
     measured: Sequence[FrequencyResponse] = (),
@@ -278,61 +303,6 @@ def provenance_of(
         coherent_share=share,
         coherent_band_hz=band_hz,
     )
-
-
-def measured_modes(fit: Fit) -> tuple[MeasuredMode, ...]:
-    """Return the modes of a fit as in documents, without unknown figures."""
-    return tuple(
-        MeasuredMode(
-            f_hz=m.f_hz,
-            zeta=m.zeta,
-            f_sd_hz=m.f_sd_hz if np.isfinite(m.f_sd_hz) else None,
-            zeta_sd=m.zeta_sd if np.isfinite(m.zeta_sd) else None,
-        )
-        for m in fit.modes
-    )
-
-
-def delay_warning(x: Fit, y: Fit) -> str | None:
-    """Return a warning if the delays of two axes differ by more than 0.2 ms.
-
-    A delay that both share only shifts time; one that differs shears corners.
-    """
-    apart = abs(x.delay_s - y.delay_s)
-    if apart <= _DELAYS_DIFFER_S or x.magnitude_only or y.magnitude_only:
-        return None
-    return (
-        f"the delays of the axes differ by {apart * 1e3:.2f} ms (X {x.delay_s * 1e3:.2f}, "
-        f"Y {y.delay_s * 1e3:.2f} ms), more than {_DELAYS_DIFFER_S * 1e3:g} ms: corners would "
-        "shear; measure both axes again in one session"
-    )
-
-
-def delays_compared(found: dict[Axis, AxisIdentification]) -> dict[Axis, AxisIdentification]:
-    """Warn about delays that differ, where the measurement shared a clock with its command."""
-    fits = [one.fit for _, one in sorted(found.items()) if keeps_time(one) and one.fit]
-    warning = delay_warning(fits[0], fits[1]) if len(fits) == 2 else None
-    if warning is None:
-        return found
-    return {a: replace(one, warnings=(*one.warnings, warning)) for a, one in found.items()}
-
-
-def _by_label(measured: Sequence[FrequencyResponse], axis: str) -> list[list[FrequencyResponse]]:
-    if not measured:
-        raise ModelError(f"axis {axis}: no frequency response to identify from; give one or more")
-    groups: dict[str, list[FrequencyResponse]] = {}
-    for response in measured:
-        groups.setdefault(response.label, []).append(response)
-    return list(groups.values())
-
-
-def _parts(
-    progress: Callable[[float], None] | None,
-) -> tuple[Callable[[float], None] | None, Callable[[float], None] | None]:
-    """Part progress between a fit and the draws after it."""
-    if progress is None:
-        return None, None
-    return lambda part: progress(0.5 * part), lambda part: progress(0.5 + 0.5 * part)
 
 
 def _weighted(plants: Sequence[PlantSpec], weights: Sequence[float]) -> tuple[WeightedMember, ...]:
@@ -388,9 +358,11 @@ def _outside_scatter(fits: list[Fit], nominal: Fit, scatter: Array) -> list[Fit]
     return [fits[i] for i in sorted(farthest)]
 
 
-def _set_notes(names: list[str], fits: list[Fit], kept: list[Fit], nominal: Fit) -> tuple[str, ...]:
+def _set_warnings(
+    names: list[str], fits: list[Fit], kept: list[Fit], nominal: Fit
+) -> tuple[str, ...]:
     pairs = list(zip(names, fits, strict=False))
-    notes = [
+    warnings = [
         f"{name or 'a measurement'}: the pairs of the mean leave {100 * fit.residual:.2g} % "
         f"of it (of the mean {100 * nominal.residual:.2g} %); fit it by itself, another "
         "mode may have moved into the band"
@@ -399,14 +371,14 @@ def _set_notes(names: list[str], fits: list[Fit], kept: list[Fit], nominal: Fit)
     ]
     main = sorted((max(fit.modes, key=lambda m: m.peak).f_hz, name) for name, fit in pairs)
     if main and main[-1][0] > _NO_MIDDLE * main[0][0]:
-        notes.append(
+        warnings.append(
             f"what rings most is at {main[0][0]:.1f} Hz in {main[0][1] or 'a measurement'} and at "
             f"{main[-1][0]:.1f} Hz in {main[-1][1] or 'another'}, too far apart for a plant in the "
             "middle; say where each was measured (FILE@z=150), or leave all but one label out"
         )
     if len(kept) < len(fits):
-        notes.append(
+        warnings.append(
             f"{len(fits) - len(kept)} of {len(fits)} measurements add no member of their own: "
             f"they lie within the scatter of repeats, or {_MOST_MEMBERS} plants are enough"
         )
-    return tuple(notes)
+    return tuple(warnings)

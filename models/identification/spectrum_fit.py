@@ -28,7 +28,7 @@ from stillpath.models.identification.frame import (
 from stillpath.models.identification.messages import (
     apart_warning,
     cross_axis_warning,
-    frame_mode_notes,
+    frame_mode_warnings,
     spectrum_level_warning,
 )
 from stillpath.models.identification.representatives import Population, mode_spread, representatives
@@ -117,16 +117,8 @@ class Explanations:
         best = {
             n: min(c.residual_db for c in found if c.structure.modes == n) for n in search.orders
         }
-        cross = cross_axis_share(mean_spectrum(self.spectra), self.column, search.model.band_hz)
-        names = ", ".join(one.source for one in self.spectra)
-        notes = (
-            *spectrum_level_warning(gain, self.excitation, names),
-            *cross_axis_warning(*cross, self.column),
-            *apart_warning(self.spectra, search.repeats),
-            *frame_mode_notes(
-                chosen.structure.spec(chosen.theta), population.members[0], table=True
-            ),
-        )
+        felt = chosen.structure.spec(chosen.theta)
+        left_out = frame_mode_warnings(felt, population.members[0], table=True)
         fit = Fit(
             spec=population.members[0],
             residual=chosen.residual_db,
@@ -137,9 +129,20 @@ class Explanations:
             trials=tuple(OrderTrial(n, db) for n, db in best.items()),
             magnitude_only=True,
             trust_below_hz=min(population.agree_below_hz(), search.model.band_hz[1]),
-            notes=notes,
+            notes=(*self._warnings(gain), *left_out),
         )
         return Explained(fit, population)
+
+    def _warnings(self, gain: float) -> tuple[str, ...]:
+        """Return what speaks against the spectra, of which a fit has this gain."""
+        band_hz = self.search.model.band_hz
+        cross = cross_axis_share(mean_spectrum(self.spectra), self.column, band_hz)
+        names = ", ".join(one.source for one in self.spectra)
+        return (
+            *spectrum_level_warning(gain, self.excitation, names),
+            *cross_axis_warning(*cross, self.column),
+            *apart_warning(self.spectra, self.search.repeats),
+        )
 
 
 def explanations(
@@ -172,11 +175,12 @@ def explanations(
     tests = [excitation] if isinstance(excitation, Excitation) else excitation
     test = same_test(spectra, tests)
     single = mean_spectrum(spectra)
-    name = _column(single, test, column)
+    name = column or driven_column(single, test.f_start_hz)
     search = Search(single, name, test, spectra, max_order)
     found = search.candidates(progress)
-    accepted, drawn = _explanations(search, found, progress)
+    accepted, drawn = _accepted_and_drawn(search, found, progress)
     explaining = tuple(c for some in accepted for c in some)
+    likeliest = tuple(c for some in accepted for c in some if c.cost <= some[0].cost + _AS_LIKELY)
     return Explanations(
         spectra=tuple(spectra),
         excitation=test,
@@ -184,9 +188,7 @@ def explanations(
         search=search,
         found=tuple(found),
         accepted=explaining,
-        likeliest=tuple(
-            c for some in accepted for c in some if c.cost <= some[0].cost + _AS_LIKELY
-        ),
+        likeliest=likeliest,
         drawn=tuple(drawn),
         frame_hz=frame_hz_of([c.structure.spec(c.theta) for c in (*explaining, *drawn)]),
     )
@@ -209,7 +211,7 @@ def same_test(spectra: Sequence[Spectrum], tests: Sequence[Excitation]) -> Excit
     return tests[0]
 
 
-def _explanations(
+def _accepted_and_drawn(
     search: Search, found: Sequence[Candidate], progress: Callable[[float], None] | None
 ) -> tuple[list[list[Candidate]], list[Candidate]]:
     """Return what explains the spectra by kind of scatter, the best first, and draws around it."""
@@ -234,7 +236,7 @@ def refit_spectrum(
     ModelError
         As `explanations`.
     """
-    name = _column(spectrum, excitation, column)
+    name = column or driven_column(spectrum, excitation.f_start_hz)
     search = Search(spectrum, name, excitation, [spectrum], len(like.modes))
     whitening = whitening_of(SCATTERS[0].covariance(search.model))
     fitted = search.polished(search.like(like.spec), whitening, search.model.log_psd, 40)
@@ -248,14 +250,3 @@ def refit_spectrum(
         trials=(OrderTrial(fitted.structure.modes, fitted.residual_db),),
         magnitude_only=True,
     )
-
-
-def _column(spectrum: Spectrum, excitation: Excitation, column: str | None) -> str:
-    if column is None:
-        return driven_column(spectrum, excitation.f_start_hz)
-    if column not in spectrum.psd:
-        raise ModelError(
-            f"{spectrum.source or 'spectrum'}: no column {column!r}; there are "
-            f"{', '.join(spectrum.psd)}"
-        )
-    return column

@@ -97,9 +97,10 @@ def spectrum_model(spectrum: Spectrum, column: str, excitation: Excitation) -> S
         If the column is missing or dead, or too few bins are left.
     """
     f, bin_hz = _bins(spectrum.f_hz)
+    source = spectrum.source or "spectrum"
     if column not in spectrum.psd:
         raise ModelError(
-            f"{spectrum.source}: no column of the sensor's axis {column!r}, only "
+            f"{source}: no column of the sensor's axis {column!r}, only "
             f"{', '.join(spectrum.psd)}; give another sensor_axis"
         )
     psd = spectrum.psd[column]
@@ -108,7 +109,6 @@ def spectrum_model(spectrum: Spectrum, column: str, excitation: Excitation) -> S
     # Klipper interpolates tables of several data sets every 0.2 Hz: no more is known than by bin.
     apart = max(1, round(bin_hz / float(np.median(np.diff(f)))))
     use &= np.arange(len(f)) % apart == 0
-    source = spectrum.source or "spectrum"
     if use.sum() < _LEAST_BINS:
         raise ModelError(
             f"{source}: {int(use.sum())} bins between {_LOWEST_HZ:g} Hz and the end of the test "

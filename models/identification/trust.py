@@ -1,8 +1,9 @@
-"""Refuse models that a measurement cannot support, and say what to measure instead."""
+"""Refuse models that a measurement cannot support, and axes that do not fit together; say why."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from stillpath.models.identification.alignment import check_pair
 from stillpath.models.identification.response_data import LEAST_COHERENCE, coherent
 from stillpath.models.identification.spectrum_model import moved_most
 from stillpath.models.identification.types import (
+    Axis,
     AxisIdentification,
     Fit,
     FrequencyResponse,
@@ -23,6 +25,8 @@ __all__ = [
     "check_directions",
     "check_informative",
     "check_repeats",
+    "delay_warning",
+    "delays_compared",
     "keeps_time",
     "main_mode",
     "main_mode_known",
@@ -46,6 +50,8 @@ perpendicular motions cannot both."""
 _MOST_APART_S = 2e-3
 """Largest plausible difference between the delays of two axes: beyond it, a wrong clock or noise
 is the cause rather than a drive, belt or sensor."""
+_DELAYS_DIFFER_S = 0.2e-3
+"""Difference from which corners would shear."""
 _MEASURE = (
     "Measure the whole band: Klipper's TEST_RESONANCES with OUTPUT=raw_data, or a swept sine from "
     "5 to 130 Hz, with the sensor on what moves (the head; the bed of a bed slinger)"
@@ -160,6 +166,30 @@ def check_axes(found: Sequence[AxisIdentification]) -> None:
             f"{of_y.delay_s * 1e3:.2f} ms), at most {_MOST_APART_S * 1e3:g} ms is to be expected "
             "of one machine: clocks that differ, or noise. Measure both axes again in one session"
         )
+
+
+def delay_warning(x: Fit, y: Fit) -> str | None:
+    """Return a warning if the delays of two axes differ by more than 0.2 ms.
+
+    A delay that both share only shifts time; one that differs shears corners.
+    """
+    apart = abs(x.delay_s - y.delay_s)
+    if apart <= _DELAYS_DIFFER_S or x.magnitude_only or y.magnitude_only:
+        return None
+    return (
+        f"the delays of the axes differ by {apart * 1e3:.2f} ms (X {x.delay_s * 1e3:.2f}, "
+        f"Y {y.delay_s * 1e3:.2f} ms), more than {_DELAYS_DIFFER_S * 1e3:g} ms: corners would "
+        "shear; measure both axes again in one session"
+    )
+
+
+def delays_compared(found: dict[Axis, AxisIdentification]) -> dict[Axis, AxisIdentification]:
+    """Warn about delays that differ, where the measurement shared a clock with its command."""
+    fits = [one.fit for _, one in sorted(found.items()) if keeps_time(one) and one.fit]
+    warning = delay_warning(fits[0], fits[1]) if len(fits) == 2 else None
+    if warning is None:
+        return found
+    return {a: replace(one, warnings=(*one.warnings, warning)) for a, one in found.items()}
 
 
 def check_directions(found: Iterable[AxisIdentification], *, stated: bool = False) -> None:

@@ -16,9 +16,9 @@ from stillpath.applications.identification.archive import Archive
 from stillpath.applications.identification.figures import IdentificationReport
 from stillpath.applications.machines.resolve import Resolver
 from stillpath.applications.machines.revision import Revision, identified_from
+from stillpath.models.complaints import explain
 from stillpath.models.identification.readers.settings import ReadSettings
 from stillpath.models.machine import Machine
-from stillpath.models.store import explain
 from stillpath.service.api.access import Reader, Uploader
 from stillpath.service.api.computing import WAITING, ComputeRequest, read_result, run_and_wait
 from stillpath.service.api.forms import is_form

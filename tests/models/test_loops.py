@@ -120,8 +120,12 @@ def test_refusals(tmp_path: Path) -> None:
         load_loop(tmp_path / "none.json")
     document = json.loads(load_loop("galvo-10khz").model_dump_json())
     document["loop"]["dt_s"] = -1
-    with pytest.raises(ModelError, match=r"mine: loop\.servo\.dt_s"):
+    with pytest.raises(
+        ModelError, match=r"mine: loop\.servo\.dt_s: must be more than 0 s \(given: -1"
+    ):
         read_loop(json.dumps(document), "mine")
+    with pytest.raises(ModelError, match="mine: 'name' is there twice"):
+        read_loop('{"name": "a", "name": "b"}', "mine")
     with pytest.raises(ModelError, match="not JSON"):
         read_loop(b"\xff")
     document["loop"]["dt_s"] = 1e-4

@@ -12,7 +12,6 @@ from stillpath.models.errors import ModelError
 from stillpath.models.identification.averaging import mean_response, mean_spectrum
 from stillpath.models.identification.sets import (
     Origin,
-    delay_warning,
     model_file_set,
     parametric_members,
     plant_set_from,
@@ -21,6 +20,7 @@ from stillpath.models.identification.sets import (
 )
 from stillpath.models.identification.spectrum_fit import explanations
 from stillpath.models.identification.synthetic import Sensor, simulate_spectrum
+from stillpath.models.identification.trust import delay_warning
 from stillpath.models.identification.types import Excitation, FrequencyResponse, Spectrum
 from stillpath.models.plants import (
     Mode,

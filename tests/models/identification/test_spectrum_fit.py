@@ -206,7 +206,7 @@ def test_column_that_follows_the_drive() -> None:
     turned = replace(spectrum, psd={"x": spectrum.psd["y"], "z": spectrum.psd["x"]})
     assert driven_column(turned) == "z"
     assert explain_spectra([turned], LEGACY).fit.spec == narrow().explained().fit.spec
-    with pytest.raises(ModelError, match="no column 'q'; there are x, z"):
+    with pytest.raises(ModelError, match="axis 'q', only x, z; give another sensor_axis"):
         explain_spectra([turned], LEGACY, column="q")
 
 
