@@ -59,6 +59,11 @@ _POOR, _POOR_DB = 0.15, 1.1
 _USELESS, _USELESS_DB = 0.5, 6.0
 """Residuals beyond which a fit is no model of what was measured."""
 _AHEAD_S = 1e-3
+_COPIED = (
+    ". Creality's K1 writes the table of Y as that of X, too, after SHAPER_CALIBRATE AXIS=Y: then "
+    "measure X (TEST_RESONANCES AXIS=X)"
+)
+"""cmd_SHAPER_CALIBRATE of its klippy/extras/resonance_tester.py (2025-08)."""
 _LEAST_COHERENCE, _LEAST_POINTS, _SLOPE_TOLERANCE = 0.95, 4, 0.2
 _WARNING = "warning: "
 
@@ -95,7 +100,8 @@ def table_mounting_notes(
     for source, most, share in moved:
         if most != axis and share > _MOSTLY:
             kind = _WARNING if most in "xy" and not turned else ""
-            notes.append((source, kind + _turned_text(most, axis, "table")))
+            cause = _COPIED if (axis, most) == ("x", "y") else ""
+            notes.append((source, kind + _turned_text(most, axis, "table") + cause))
     return notes
 
 
