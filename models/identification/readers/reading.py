@@ -19,7 +19,13 @@ from stillpath.models.identification.readers.model_files import read_json_models
 from stillpath.models.identification.readers.responses import is_response, read_responses
 from stillpath.models.identification.readers.settings import ReadSettings, direction_of
 from stillpath.models.identification.readers.shaketune import is_shaketune, read_shaketune
-from stillpath.models.identification.readers.spectra import MOST_BINS, is_spectrum, read_spectrum
+from stillpath.models.identification.readers.spectra import (
+    GAINS_TEXT,
+    MOST_BINS,
+    is_gains,
+    is_spectrum,
+    read_spectrum,
+)
 from stillpath.models.identification.readers.tables import Table, as_table, check_size
 from stillpath.models.identification.types import Measurement
 from stillpath.models.user_files import as_utf8
@@ -148,6 +154,8 @@ def _from_table(table: Table, axis: str | None, settings: ReadSettings) -> tuple
         return (read_m956(table, axis, settings),)
     if is_response(table):
         return read_responses(table, axis, settings)
+    if is_gains(table):
+        raise ModelError(f"{table.source}: {GAINS_TEXT}")
     if is_spectrum(table):
         return (read_spectrum(table, axis, settings),)
     if is_drive(table, settings):

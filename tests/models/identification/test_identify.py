@@ -606,6 +606,15 @@ def test_a_level_that_is_too_low_may_be_friction(gain: float) -> None:
     assert ("rubs much" in warning) == (gain < 1.0)
 
 
+@pytest.mark.parametrize(("stated", "gain"), [(75.0, 0.0092), (0.69, 1.0)])
+def test_gains_are_no_densities(stated: float, gain: float) -> None:
+    """What M959 K of Prusa's firmware prints; with the accel_per_hz it was said to have, a wrong
+    machine was made."""
+    test = replace(LEGACY, accel_per_hz_mm_s=stated)
+    with pytest.raises(ModelError, match=r"no test is below 3: .* Prusa's M958 and M959"):
+        spectrum_level_warning(gain, test, "table.csv")
+
+
 TABLES = SETTINGS.model_copy(update={"f_end_hz": 80.0})
 
 
