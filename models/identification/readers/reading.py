@@ -163,6 +163,12 @@ def _from_table(table: Table, axis: str | None, settings: ReadSettings) -> tuple
     hint = ""
     if "position_mm" in table.names:
         hint = "; of a pass ripple is learnt: say what repeats (--ripple NAME:PITCH)"
+    elif {"x", "y", "z"} <= set(table.names):
+        hint = (
+            "; accelerations alone (OctoPrint's Pinput Shaping, adxl345spi) do not say what was "
+            "commanded: type in the frequencies that the tool shows (machines from-m503, --fx and "
+            "--fy), or record command and acceleration together"
+        )
     elif table.names and len(table.rows) > 1:
         hint = (
             "; if it records a command and what followed, call those columns time_s, cmd_acc and "
