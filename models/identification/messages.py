@@ -67,6 +67,13 @@ _COPIED = (
     "measure X (TEST_RESONANCES AXIS=X)"
 )
 """cmd_SHAPER_CALIBRATE of its klippy/extras/resonance_tester.py (2025-08)."""
+_ALIKE = 0.6
+"""Of a unit vector: as much along two axes of the sensor, give or take 8 degrees."""
+_BETWEEN = (
+    "the sensor moved as much along its {} as along its {}, so it was taken to be turned by half a "
+    "right angle; if it is not, this is the test of a belt (AXIS=1,1 or 1,-1), which is of neither "
+    "X nor Y"
+)
 _LEAST_COHERENCE, _LEAST_POINTS, _SLOPE_TOLERANCE = 0.95, 4, 0.2
 _WARNING = "warning: "
 
@@ -87,6 +94,9 @@ def mounting_notes(axis: str, responses: Sequence[FrequencyResponse]) -> list[st
         most = max(along, key=along.__getitem__, default=axis)
         if most != axis and along[most] > _MOSTLY:
             notes.append((response.source, _turned_text(most, axis, "log")))
+        alike = [name for name, share in along.items() if share > _ALIKE]
+        if len(alike) == 2:
+            notes.append((response.source, _WARNING + _BETWEEN.format(*alike)))
     return by_file(notes)
 
 

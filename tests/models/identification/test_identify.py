@@ -18,7 +18,11 @@ from stillpath.models.errors import ModelError
 from stillpath.models.identification.conditioned import Tested, of_one_test
 from stillpath.models.identification.conditions import Condition
 from stillpath.models.identification.identify import Measured, identify
-from stillpath.models.identification.messages import phase_warning, spectrum_level_warning
+from stillpath.models.identification.messages import (
+    mounting_notes,
+    phase_warning,
+    spectrum_level_warning,
+)
 from stillpath.models.identification.modal_fit import fit_modes
 from stillpath.models.identification.prompt import prompt
 from stillpath.models.identification.readers import ReadSettings, read_content
@@ -369,6 +373,18 @@ def test_one_axis_measured_twice() -> None:
         identify(read(*files), SETTINGS)
     turned = SETTINGS.model_copy(update={"sensor_turned": True})
     assert list(identify(read(*files), turned)) == ["x", "y"]
+
+
+@pytest.mark.parametrize(
+    ("direction", "warned"),
+    [((0.72, -0.69, 0.02), True), ((0.1, 0.68, 0.73), True), ((0.87, 0.5, 0.0), False)],
+)
+def test_a_belt_tested_as_an_axis(direction: tuple[float, ...], warned: bool) -> None:
+    """A test of a belt, called X, was said to have coupled axes."""
+    felt = replace(response(one_mode(40.0, 0.05)), sensor_direction=direction)
+    found = [note for note in mounting_notes("x", [felt]) if "test of a belt" in note]
+    assert len(found) == warned
+    assert all("warning: the sensor moved as much along its" in note for note in found)
 
 
 TURNED_ROUND_Z = ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
