@@ -20,7 +20,7 @@ from stillpath.models.identification.conditioned import schedulable
 from stillpath.models.identification.conditions import Condition
 from stillpath.models.identification.identify import Measured, Progress, identify
 from stillpath.models.identification.readers import ReadSettings, read_content
-from stillpath.models.identification.types import AxisIdentification
+from stillpath.models.identification.types import AccelerationLog, AxisIdentification, Spectrum
 from stillpath.models.machine import Machine
 from stillpath.models.plants import PlantSpec, discretise
 from stillpath.models.provenance import SourceFile
@@ -121,6 +121,7 @@ def _read(
     """Read all files; refuse a copy, which would be taken for a repeat that scatters by nothing."""
     measured: list[Measured] = []
     known: dict[tuple[str | None, Condition, bytes], InputFile] = {}
+    recorded: dict[bytes, InputFile] = {}
     for file in files:
         if progress is not None:
             progress(f"reading {file.name}", 0.0)
@@ -131,8 +132,21 @@ def _read(
                     f"{file.name} is a copy of {first.name}, and a copy is no repeat: give each "
                     "recording once"
                 )
+            if isinstance(measurement, AccelerationLog | Spectrum):
+                _check_recorded_once(recorded.setdefault(file.content, file), file)
             measured.append(Measured(measurement, file.condition))
     return measured
+
+
+def _check_recorded_once(first: InputFile, file: InputFile) -> None:
+    """Refuse the recording of a test that is given as one of another axis or condition, too."""
+    if first is not file:
+        raise ModelError(
+            f"{file.name} is a copy of {first.name}, but a test is of one axis and one condition: "
+            "leave out the one with the wrong name, and measure what is missing. (Creality's K1 "
+            "writes the table of Y as that of X, too, after SHAPER_CALIBRATE AXIS=Y: run "
+            "TEST_RESONANCES AXIS=X, then AXIS=Y)"
+        )
 
 
 def _check_sampled(axis: Axis, plant: PlantSpec) -> None:

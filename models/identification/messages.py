@@ -13,6 +13,7 @@ from stillpath.models.friction import LEAST_MM_S2, Guides
 from stillpath.models.identification.estimation import plateau_gain
 from stillpath.models.identification.nozzle import Frame
 from stillpath.models.identification.readers.checks import RANGE_ENDED
+from stillpath.models.identification.readers.spectra import GAINS_TEXT
 from stillpath.models.identification.spectrum_model import moved_most
 from stillpath.models.identification.trust import main_mode, main_mode_known
 from stillpath.models.identification.types import (
@@ -54,11 +55,25 @@ _LEVEL_TOLERANCE = 0.15
 _LEVELS = (0.3, 3.0)
 _TABLE_LEVELS = (0.2, 5.0)
 """Of tables, which do not say their accel_per_hz: 12 to 300 where it is not stated."""
+_LEAST_MM_S = 3.0
+"""Least accel_per_hz: a test of 3 mm/s^2 per Hz is lost in the noise of sensors."""
 _AS_WEAK = 0.1
 _POOR, _POOR_DB = 0.15, 1.1
 _USELESS, _USELESS_DB = 0.5, 6.0
 """Residuals beyond which a fit is no model of what was measured."""
 _AHEAD_S = 1e-3
+_COPIED = (
+    ". Creality's K1 writes the table of Y as that of X, too, after SHAPER_CALIBRATE AXIS=Y: then "
+    "measure X (TEST_RESONANCES AXIS=X)"
+)
+"""cmd_SHAPER_CALIBRATE of its klippy/extras/resonance_tester.py (2025-08)."""
+_ALIKE = 0.6
+"""Of a unit vector: as much along two axes of the sensor, give or take 8 degrees."""
+_BETWEEN = (
+    "the sensor moved as much along its {} as along its {}, so it was taken to be turned by half a "
+    "right angle; if it is not, this is the test of a belt (AXIS=1,1 or 1,-1), which is of neither "
+    "X nor Y"
+)
 _LEAST_COHERENCE, _LEAST_POINTS, _SLOPE_TOLERANCE = 0.95, 4, 0.2
 _WARNING = "warning: "
 
@@ -79,6 +94,9 @@ def mounting_notes(axis: str, responses: Sequence[FrequencyResponse]) -> list[st
         most = max(along, key=along.__getitem__, default=axis)
         if most != axis and along[most] > _MOSTLY:
             notes.append((response.source, _turned_text(most, axis, "log")))
+        alike = [name for name, share in along.items() if share > _ALIKE]
+        if len(alike) == 2:
+            notes.append((response.source, _WARNING + _BETWEEN.format(*alike)))
     return by_file(notes)
 
 
@@ -95,7 +113,8 @@ def table_mounting_notes(
     for source, most, share in moved:
         if most != axis and share > _MOSTLY:
             kind = _WARNING if most in "xy" and not turned else ""
-            notes.append((source, kind + _turned_text(most, axis, "table")))
+            cause = _COPIED if (axis, most) == ("x", "y") else ""
+            notes.append((source, kind + _turned_text(most, axis, "table") + cause))
     return notes
 
 
@@ -338,13 +357,23 @@ def spectrum_level_warning(gain: float, excitation: Excitation, names: str) -> t
         If the sensor hardly moved with the test, or far too much.
     """
     stated = excitation.accel_per_hz_mm_s
+    seen = (
+        f"{names}: at low frequency the sensor moved {gain:.2g} times as much as a test with "
+        f"accel_per_hz {stated:g} commands"
+    )
+    if not gain * stated >= _LEAST_MM_S:
+        raise ModelError(
+            f"{seen}, so accel_per_hz would be {gain * stated:.2g}, and no test is below "
+            f"{_LEAST_MM_S:g}: the table holds only noise, the sensor was not mounted on what this "
+            f"axis moves, the test began above {excitation.f_start_hz:g} Hz (then give min_freq), "
+            f"or it is no test of Klipper's: {GAINS_TEXT}. Else measure again"
+        )
     if not _TABLE_LEVELS[0] < gain < _TABLE_LEVELS[1]:
         raise ModelError(
-            f"{names}: at low frequency the sensor moved {gain:.2g} times as much as a test with "
-            f"accel_per_hz {stated:g} commands, {_TABLE_LEVELS[0]:g} to {_TABLE_LEVELS[1]:g} is to "
-            "be expected: it was not mounted on what this axis moves (the head; the bed of a bed "
-            "slinger), the table holds only noise, or the test began at a higher min_freq than "
-            f"{excitation.f_start_hz:g} Hz. If that, or accel_per_hz {gain * stated:.3g}, was so, "
+            f"{seen}, {_TABLE_LEVELS[0]:g} to {_TABLE_LEVELS[1]:g} is to be expected: it was not "
+            "mounted on what this axis moves (the head; the bed of a bed slinger), the table holds "
+            f"only noise, or the test began at a higher min_freq than {excitation.f_start_hz:g} "
+            f"Hz. If that, or accel_per_hz {gain * stated:.3g}, was so, "
             "say it; else measure again"
         )
     if abs(gain - 1) <= 2 * _LEVEL_TOLERANCE:

@@ -28,6 +28,7 @@ from tests.models.identification.recordings import (
     broken,
     one_mode,
     quick_raw,
+    spectrum_file,
 )
 from tests.models.test_ripple import ripple
 from tests.service.machines import make_machine
@@ -298,6 +299,20 @@ def test_one_broken_file_among_good_ones(store: MachineStore, folder: Path, caps
     before = tree(folder.parent)
     assert identify(*arguments, "-m", "mine", "-o", folder / "out.json") == 2
     assert "gap in time" in one_line(capsys)
+    assert tree(folder.parent) == before
+
+
+@pytest.mark.parametrize("options", ["", "--sensor-turned", "--sensor-axis y"])
+def test_a_table_is_not_of_two_axes(
+    store: MachineStore, folder: Path, capsys: pytest.CaptureFixture[str], options: str
+) -> None:
+    """As a K1 writes it after SHAPER_CALIBRATE AXIS=Y; advised options made X the same as Y."""
+    table = spectrum_file(one_mode(42.0, 0.06))
+    other = InputFile(table.name.replace("_x_", "_y_"), table.content)
+    files = placed([table, other], folder)
+    before = tree(folder.parent)
+    assert run(["identify", *files, "-m", "mine", *options.split()]) == 2
+    assert "_y_20260101_120000.csv is a copy of resonances_x_2026" in one_line(capsys)
     assert tree(folder.parent) == before
 
 

@@ -16,7 +16,7 @@ from stillpath.models.identification.readers.checks import (
     sensor_axes,
 )
 from stillpath.models.identification.readers.lost_samples import restored
-from stillpath.models.identification.readers.settings import ReadSettings
+from stillpath.models.identification.readers.settings import NO_TEST, ReadSettings
 from stillpath.models.identification.readers.spikes import sound_samples
 from stillpath.models.identification.readers.tables import MOST_ROWS, Table
 from stillpath.models.identification.types import AccelerationLog
@@ -31,11 +31,6 @@ _LARGEST_G = 40.0
 _LEAST_SAMPLES = 64
 _BRIDGED_S = 0.01
 """A message of the sensor's board, which nobody sends again, has 8 or 10 samples."""
-_NO_TEST = (
-    "RepRapFirmware has no resonance test of its own, and its log does not say what moved: type "
-    "the frequencies in (machines from-config, --fx and --fy) and let verify read the log of a "
-    "ring-test, or record command and acceleration together"
-)
 _KLIPPER = ("accel_x", "accel_y", "accel_z")
 _TRAILER = re.compile(r"rate\s+([\d.]+)\s*,?\s*overflows\s+(\d+)", re.IGNORECASE)
 _OVERFLOWS = re.compile(r"overflows\W{0,4}(\d+)", re.IGNORECASE)
@@ -106,7 +101,7 @@ def read_m956(table: Table, axis: str | None, settings: ReadSettings) -> Acceler
         accel[:, "xyz".index(name)] = values[:, i] * _UNITS[settings.acceleration_unit or "g"]
     columns = dict(zip("xyz", accel.T, strict=True))
     notes = _notes(columns, table, axis, settings)
-    return AccelerationLog(values[:, 0] / rate_hz, accel, axis, table.source, (_NO_TEST, *notes))
+    return AccelerationLog(values[:, 0] / rate_hz, accel, axis, table.source, (NO_TEST, *notes))
 
 
 def _unit(values: Array) -> str:

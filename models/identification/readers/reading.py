@@ -18,8 +18,18 @@ from stillpath.models.identification.readers.matlab import is_matlab
 from stillpath.models.identification.readers.model_files import read_json_models, read_matlab_models
 from stillpath.models.identification.readers.responses import is_response, read_responses
 from stillpath.models.identification.readers.settings import ReadSettings, direction_of
-from stillpath.models.identification.readers.shaketune import is_shaketune, read_shaketune
-from stillpath.models.identification.readers.spectra import MOST_BINS, is_spectrum, read_spectrum
+from stillpath.models.identification.readers.shaketune import (
+    BELTS,
+    is_shaketune,
+    read_shaketune,
+)
+from stillpath.models.identification.readers.spectra import (
+    GAINS_TEXT,
+    MOST_BINS,
+    is_gains,
+    is_spectrum,
+    read_spectrum,
+)
 from stillpath.models.identification.readers.tables import Table, as_table, check_size
 from stillpath.models.identification.types import Measurement
 from stillpath.models.user_files import as_utf8
@@ -37,6 +47,8 @@ _KLIPPER_NAME = re.compile(
 _STATED_NAME = re.compile(
     rf"(?<![a-z0-9])(?:axis[ =_-]?({_DIRECTION}|[xyz])|([xyz])[ _-]?axis)(?![a-z0-9])"
 )
+# belt_<date>_A.csv and belts_<date>_A.csv of Shake&Tune 1 to 4, and its shaketune-belt_A.csv.
+_BELT_NAME = re.compile(r"(?:^|[_-])belts?_(?:\w+_)?([ab])(?=[_.]|$)")
 # With the number of a repeat: of qidi-x-max-y1.csv, x alone would count.
 _ANY_NAME = re.compile(rf"(?:^|[_-])({_DIRECTION}|[xyz])\d?(?=[_.-]|$)")
 _LOOKED_FOR = (
@@ -148,6 +160,8 @@ def _from_table(table: Table, axis: str | None, settings: ReadSettings) -> tuple
         return (read_m956(table, axis, settings),)
     if is_response(table):
         return read_responses(table, axis, settings)
+    if is_gains(table):
+        raise ModelError(f"{table.source}: {GAINS_TEXT}")
     if is_spectrum(table):
         return (read_spectrum(table, axis, settings),)
     if is_drive(table, settings):
@@ -155,6 +169,12 @@ def _from_table(table: Table, axis: str | None, settings: ReadSettings) -> tuple
     hint = ""
     if "position_mm" in table.names:
         hint = "; of a pass ripple is learnt: say what repeats (--ripple NAME:PITCH)"
+    elif {"x", "y", "z"} <= set(table.names):
+        hint = (
+            "; accelerations alone (OctoPrint's Pinput Shaping, adxl345spi) do not say what was "
+            "commanded: type in the frequencies that the tool shows (machines from-m503, --fx and "
+            "--fy), or record command and acceleration together"
+        )
     elif table.names and len(table.rows) > 1:
         hint = (
             "; if it records a command and what followed, call those columns time_s, cmd_acc and "
@@ -170,8 +190,8 @@ def _from_table(table: Table, axis: str | None, settings: ReadSettings) -> tuple
 def _axes_in_name(name: str) -> tuple[str, ...]:
     """Return the axis in Klipper's name of a file, else those it calls axis, else may mean."""
     name = name.lower()
-    klipper = _KLIPPER_NAME.search(name)
-    texts = [klipper[1]] if klipper else []
+    klipper, belt = _KLIPPER_NAME.search(name), _BELT_NAME.search(name)
+    texts = [klipper[1]] if klipper else [BELTS[belt[1]]] if belt else []
     for pattern in (_STATED_NAME, _ANY_NAME):
         texts = texts or [next(filter(None, one.groups())) for one in pattern.finditer(name)]
     return tuple(dict.fromkeys(text for text in texts if _is_axis(text)))

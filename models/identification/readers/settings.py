@@ -23,6 +23,7 @@ from stillpath.models.identification.types import (
 )
 
 __all__ = [
+    "NO_TEST",
     "ReadSettings",
     "date_in_name",
     "direction_of",
@@ -34,6 +35,12 @@ __all__ = [
 Column = str | Annotated[int, Field(ge=0)]
 """By name, or counted from 0."""
 
+NO_TEST = (
+    "RepRapFirmware has no resonance test of its own, and its log does not say what moved: type "
+    "the frequencies in (machines from-config, --fx and --fy) and let verify read the log of a "
+    "ring-test, or record command and acceleration together"
+)
+"""Note of an M956 log."""
 _NEW_TEST = date(2024, 12, 1)
 _TELLS_RANGE = date(2024, 2, 17)
 """Since then a table ends at 1.5 max_freq (klippy/extras/resonance_tester.py), before at 200 Hz."""
@@ -186,8 +193,10 @@ def tested_axis(measurement: Measurement, settings: ReadSettings) -> Axis:
     Raises
     ------
     ModelError
-        If nothing says it, or the test moved both axes at once.
+        If nothing says it, the test moved both axes at once, or there was none.
     """
+    if NO_TEST in measurement.notes:
+        raise ModelError(f"{measurement.source}: {NO_TEST}")
     text = settings.axis or measurement.axis
     if text is None:
         raise ModelError(

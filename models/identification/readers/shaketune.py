@@ -13,16 +13,12 @@ from stillpath.models.identification.readers.settings import ReadSettings
 from stillpath.models.identification.readers.tables import Table
 from stillpath.models.identification.types import AccelerationLog
 
-__all__ = ["is_shaketune", "read_shaketune"]
+__all__ = ["BELTS", "is_shaketune", "read_shaketune"]
 
 _PICKLED = re.compile(rb"\x80[\x02-\x05].{0,40}name.{1,120}samples", re.DOTALL)
 _FIRST_LINE = re.compile(rb'\s*\{\s*"name"\s*:\s*"[^"\n]{0,200}"\s*,\s*"samples"\s*:')
-_AXES = {
-    "axis_x": "x",
-    "axis_y": "y",
-    "belt_a": "1.000,-1.000",
-    "belt_b": "1.000,1.000",
-}
+BELTS = {"a": "1.000,-1.000", "b": "1.000,1.000"}
+_AXES = {"axis_x": "x", "axis_y": "y", "belt_a": BELTS["a"], "belt_b": BELTS["b"]}
 """The directions of the tests, by the label with which a recording's name begins."""
 _LABEL = re.compile(rf"({'|'.join(_AXES)})(?:_|$)", re.IGNORECASE)
 

@@ -14,12 +14,19 @@ from stillpath.models.identification.readers.settings import ReadSettings
 from stillpath.models.identification.readers.tables import Table
 from stillpath.models.identification.types import Spectrum
 
-__all__ = ["MOST_BINS", "is_spectrum", "read_spectrum"]
+__all__ = ["GAINS_TEXT", "MOST_BINS", "is_gains", "is_spectrum", "read_spectrum"]
 
 MOST_BINS = 2500
 """Klipper writes some 130, up to 200 Hz, but every 0.2 Hz of several data sets: 2250 where max_freq
 is 300; work and memory grow with their square."""
 _LEAST_BINS = 16
+GAINS_TEXT = (
+    "Prusa's M958 and M959 print gains of single frequencies (with K in the form of Klipper's "
+    "tables), which are not read: type the frequencies in that M959 names (machines from-m503, "
+    "--fx and --fy)"
+)
+_GAINS_HEADERS = ("freq,psd_x,psd_y,psd_z,psd_xyz,mzv", "X_gain Y_gain Z_gain")
+_MOST_TERMINAL_LINES = 10_000
 _PER_HZ = "accel_per_hz"
 _SHAPER = re.compile(r"\w+\([\d./]+\)|(smooth_)?(zvd?|mzv|ei|[23]hump_ei|zvd_ei|si)")
 _MIN_FREQ_HZ = 5.0
@@ -29,6 +36,18 @@ _MIN_FREQ_HZ = 5.0
 def is_spectrum(table: Table) -> bool:
     """Whether the first column is Klipper's `freq`."""
     return table.names[:1] == ("freq",)
+
+
+def is_gains(table: Table) -> bool:
+    """Whether it is what M958 and M959 print, alone or in what a terminal showed.
+
+    Format: Prusa-Firmware-Buddy lib/Marlin/Marlin/src/gcode/calibrate/M958.cpp, 5.0 to 6.2: with K,
+    a column is named that the rows lack.
+    """
+    if table.first_line.strip() == _GAINS_HEADERS[0]:
+        return bool(table.rows) and len(table.split(table.rows[0])) < len(table.names)
+    lines = (table.first_line, *table.rows[:_MOST_TERMINAL_LINES])
+    return any(line.rstrip().endswith(_GAINS_HEADERS) for line in lines)
 
 
 def read_spectrum(table: Table, axis: str | None, settings: ReadSettings) -> Spectrum:

@@ -18,7 +18,11 @@ from stillpath.models.errors import ModelError
 from stillpath.models.identification.conditioned import Tested, of_one_test
 from stillpath.models.identification.conditions import Condition
 from stillpath.models.identification.identify import Measured, identify
-from stillpath.models.identification.messages import phase_warning, spectrum_level_warning
+from stillpath.models.identification.messages import (
+    mounting_notes,
+    phase_warning,
+    spectrum_level_warning,
+)
 from stillpath.models.identification.modal_fit import fit_modes
 from stillpath.models.identification.prompt import prompt
 from stillpath.models.identification.readers import ReadSettings, read_content
@@ -304,14 +308,13 @@ def test_a_dc_gain_that_was_scaled_is_a_warning() -> None:
     assert near.notes == ("m_x.json: DC gain 1.01 scaled to 1",)
 
 
-def test_a_log_of_m956_without_a_test() -> None:
-    """RepRapFirmware has no such test, so nobody should look for its frequencies."""
+@pytest.mark.parametrize("name", ["x.csv", "1-X100-200-0-none.csv"])
+def test_a_log_of_m956(name: str) -> None:
+    """RepRapFirmware has no test: frequencies or an axis do not help. (A name of Duet's plugin.)"""
     ringing = 0.3 * np.exp(-np.arange(3000) / 300) * np.sin(np.arange(3000) * 0.2)
     rows = "".join(f"{i},{v:.3f}\n" for i, v in enumerate(ringing))
-    file = InputFile("x.csv", f"Sample,X\n{rows}Rate 1600, overflows 0\n".encode())
-    with pytest.raises(
-        ModelError, match=r"too short .*RepRapFirmware has no resonance test.*verify"
-    ):
+    file = InputFile(name, f"Sample,X\n{rows}Rate 1600, overflows 0\n".encode())
+    with pytest.raises(ModelError, match=rf"^{name}: RepRapFirmware has no resonance test.*verify"):
         one(file)
 
 
@@ -370,6 +373,18 @@ def test_one_axis_measured_twice() -> None:
         identify(read(*files), SETTINGS)
     turned = SETTINGS.model_copy(update={"sensor_turned": True})
     assert list(identify(read(*files), turned)) == ["x", "y"]
+
+
+@pytest.mark.parametrize(
+    ("direction", "warned"),
+    [((0.72, -0.69, 0.02), True), ((0.1, 0.68, 0.73), True), ((0.87, 0.5, 0.0), False)],
+)
+def test_a_belt_tested_as_an_axis(direction: tuple[float, ...], warned: bool) -> None:
+    """A test of a belt, called X, was said to have coupled axes."""
+    felt = replace(response(one_mode(40.0, 0.05)), sensor_direction=direction)
+    found = [note for note in mounting_notes("x", [felt]) if "test of a belt" in note]
+    assert len(found) == warned
+    assert all("warning: the sensor moved as much along its" in note for note in found)
 
 
 TURNED_ROUND_Z = ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
@@ -606,6 +621,15 @@ def test_a_level_that_is_too_low_may_be_friction(gain: float) -> None:
     assert ("rubs much" in warning) == (gain < 1.0)
 
 
+@pytest.mark.parametrize(("stated", "gain"), [(75.0, 0.0092), (0.69, 1.0)])
+def test_gains_are_no_densities(stated: float, gain: float) -> None:
+    """What M959 K of Prusa's firmware prints; with the accel_per_hz it was said to have, a wrong
+    machine was made."""
+    test = replace(LEGACY, accel_per_hz_mm_s=stated)
+    with pytest.raises(ModelError, match=r"no test is below 3: .* Prusa's M958 and M959"):
+        spectrum_level_warning(gain, test, "table.csv")
+
+
 TABLES = SETTINGS.model_copy(update={"f_end_hz": 80.0})
 
 
@@ -655,7 +679,9 @@ def test_tables_of_x_and_y_that_may_be_exchanged_are_warned_of() -> None:
     found = identify(exchanged, TABLES, max_order=1)
     for axis, other in ("xy", "yx"):
         text = f"{axis}.csv: the sensor's {other} moved in the test of axis {axis}"
-        assert any(text in warning for warning in found[axis].warnings)
+        (warning,) = (w for w in found[axis].warnings if text in w)
+        # It copies Y to X, never X to Y.
+        assert ("Creality's K1" in warning) == (axis == "x")
 
 
 def test_a_sensor_that_is_turned_for_both_axes_is_no_fault() -> None:

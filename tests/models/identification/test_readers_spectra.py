@@ -110,6 +110,32 @@ def test_normalisation_is_undone(header: str, more: tuple[str, ...], kept: objec
     assert spectrum.notes == ("Klipper's normalisation by frequency is undone",)
 
 
+GAINS = [f"{f:.2f},1.01200,0.00100,0.00200,1.01500" for f in range(5, 151)]
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        ["freq,psd_x,psd_y,psd_z,psd_xyz,mzv", *GAINS],
+        ["echo:Running: M959 X K", "freq,psd_x,psd_y,psd_z,psd_xyz,mzv", *GAINS, "ok"],
+        [
+            "Send: M959 X",
+            "Recv: Sample freq: 1271.62",
+            "Recv: frequency[Hz] excitation[m/s^2] X[m/s^2] Y[m/s^2] Z[m/s^2] X_gain Y_gain Z_gain",
+            "Recv: 6.00 2.50 2.55800 0.02148 0.07608 1.02301 0.00859 0.03043",
+        ],
+        [
+            "excitation_frequency[Hz] excitation[m/s^2] X[m/s^2] X_gain Y_gain Z_gain",
+            "6.00 2.50 2.55800 1.02301 0.00859 0.03043",
+        ],
+    ],
+)
+def test_gains_of_prusas_firmware_are_called_so(lines: list[str]) -> None:
+    """A line had too few fields, and the advice was to complete it."""
+    with pytest.raises(ModelError, match=r"^m959\.txt: Prusa's M958 and M959 .*M959 names"):
+        read("\n".join([*lines, ""]), "m959.txt")
+
+
 def test_data_sets_with_shapers() -> None:
     written = PSD[:2] * low(F_HZ) / (F_HZ + 0.1)
     spectrum = read(table("freq,a,b,shapers:,mzv(40.2)", written, "", "0.3"))

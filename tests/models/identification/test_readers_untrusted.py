@@ -134,6 +134,9 @@ def test_files_that_are_not_read(tmp_path: Path) -> None:
         read_measurements(large)
     with pytest.raises(ModelError, match="not a known format"):
         read_content(pickle.dumps({"num": [1]}), "model.pkl")
+    with pytest.raises(ModelError, match=r"known format.*accelerations alone .*\(machines from-"):
+        # What adxl345spi writes, and OctoPrint's Pinput Shaping with it.
+        read_content(b"time, x, y, z\n0.0, 0.1, 0.0, 1.0\n0.1, 0.1, 0.0, 1.0\n", "AXIS_X_1.csv")
     with pytest.raises(ModelError, match=r"looked for .*The first line is 'hello there'"):
         read_content(b"hello there\n1,2\n", "a.csv")
     with pytest.raises(ModelError, match="say what repeats"):
