@@ -78,6 +78,27 @@ def _nothing() -> bytes:
     return bytes(llvm.parse_assembly("").as_bitcode())
 
 
+class _CacheFile(IndexDataCacheFile):
+    """Index and code of a kernel on disk; the code has its own stamp.
+
+    Numba writes the index first. What a full disk or a power cut then keeps from being written
+    leaves the code of earlier sources under its name.
+    """
+
+    def _save_data(self, name: str, data: Any) -> None:
+        super()._save_data(name, (self._stamp, data))  # type: ignore[no-untyped-call]
+
+    def _load_data(self, name: str) -> Any:
+        stamp, data = super()._load_data(name)  # type: ignore[no-untyped-call]
+        if stamp != self._stamp:
+            raise FileNotFoundError(f"{name} has code of other sources")  # numba compiles anew
+        return data
+
+    @property
+    def _stamp(self) -> Any:
+        return self._version, self._source_stamp
+
+
 class _KernelCache(FunctionCache):
     """Numba's cache on disk, with a stamp of all sources that went into the machine code.
 
@@ -89,7 +110,7 @@ class _KernelCache(FunctionCache):
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)  # type: ignore[no-untyped-call]
         file = Path(function.__code__.co_filename)
-        self._cache_file = IndexDataCacheFile(  # type: ignore[no-untyped-call]
+        self._cache_file = _CacheFile(  # type: ignore[no-untyped-call]
             cache_path=self._cache_path,
             filename_base=self._impl.filename_base,
             source_stamp=(

@@ -522,22 +522,33 @@ class Service:
             pause_s = min(1.5 * pause_s, self._LONGEST_PAUSE_S)
 
     def _fetch(self, path: str, job: Mapping[str, Any], target: Path) -> None:
-        """Write the result of a job to a file, all of it and nothing else."""
-        expected = job.get("result_bytes") or 0
+        """Write the result of a job to a file, all of it and nothing else.
+
+        A transfer that breaks off goes on where it did: results may have gigabytes.
+        """
+        expected, tag = job.get("result_bytes") or 0, ""
+
+        def missing() -> dict[str, str]:
+            begun = tag and 0 < file.tell() < expected
+            return {"Range": f"bytes={file.tell()}-", "If-Range": tag} if begun else {}
 
         def save(answer: Any) -> bytes:
-            read = 0
-            with target.open("wb") as file:
-                while chunk := _read(answer, 1 << 18):
-                    read += file.write(chunk)
-                    self._tell("fetching", min(read / max(expected, 1), 1.0))
+            nonlocal tag
+            if answer.status != 206:
+                file.seek(0)
+                file.truncate()
+                tag = answer.headers.get("ETag") or ""
+            while chunk := _read(answer, 1 << 18):
+                file.write(chunk)
+                self._tell("fetching", min(file.tell() / max(expected, 1), 1.0))
             # What a proxy answers instead may well be whole: only the job knows the size.
-            if not read or read != expected:
-                raise _Broken(f"{read} of {expected} bytes came")
+            if not expected or file.tell() != expected:
+                raise _Broken(f"{file.tell()} of {expected} bytes came", midway=bool(tag))
             return b""
 
         try:
-            self._ask("GET", f"{path}/result", self._timeout_s, take=save)
+            with target.open("wb") as file:
+                self._ask("GET", f"{path}/result", self._timeout_s, take=save, more=missing)
         except OSError as error:  # of a full disk, which does not say where
             error.filename = str(target)
             raise
@@ -562,13 +573,17 @@ class Service:
         patience_s: float,
         body: _CountedFile | None = None,
         take: Callable[[Any], bytes] = lambda answer: _read(answer),
+        more: Callable[[], Mapping[str, str]] = dict,
     ) -> bytes:
-        """Return what is taken of the answer; what may pass by itself is tried for some time."""
+        """Return what is taken of the answer; what may pass by itself is tried for some time.
+
+        `more` gives further headers of each try.
+        """
         deadline, pause_s = time.monotonic() + patience_s, 0.2
         restarts_left = self._MAX_RESTARTS
         while True:
             try:
-                with self._open(method, path, body) as answer:
+                with self._open(method, path, body, more()) as answer:
                     return take(answer)
             except _Broken as error:
                 broken = error
@@ -596,10 +611,11 @@ class Service:
         method: str,
         path: str,
         body: _CountedFile | None = None,
+        more: Mapping[str, str] = {},
         timeout_s: float | None = None,
     ) -> Any:
         """Return the open answer; raise `Failure` if it is no, `_Broken` if there is none."""
-        headers = dict(self._headers)
+        headers = {**self._headers, **more}
         if body is not None:
             headers["Content-Type"] = "application/octet-stream"
             headers["Content-Length"] = str(body.size)

@@ -313,6 +313,7 @@ class Stillpath:
                 command += [f"--{name.replace('_', '-')}", value]
         environment = {k: v for k, v in os.environ.items() if not k.startswith("SLIC3R_")}
         environment["STILLPATH_KEY"] = self._key  # not where `ps` shows it
+        environment["TMPDIR"] = str(copy.parent)  # /tmp may be memory, which a print needs
         process = await asyncio.create_subprocess_exec(
             *command,
             str(copy),

@@ -85,7 +85,7 @@ class Reconciler:
         self._trouble: str | None = None
         self._trouble_since = 0.0
         # Since when database and workers have responded without interruption.
-        self._steady_since = time.monotonic()
+        self._steady_since = self._looked_at = time.monotonic()
         self._clock_offset_s = time.time() - time.monotonic()
 
     def start(self) -> None:
@@ -211,12 +211,14 @@ class Reconciler:
 
     def _find_silent(self) -> None:
         timeout_s = self._settings.heartbeat_timeout_s
-        offset_s = time.time() - time.monotonic()
+        now, offset_s = time.monotonic(), time.time() - time.monotonic()
         if abs(offset_s - self._clock_offset_s) > _CLOCK_SET_S:
-            self._steady_since = time.monotonic()  # earlier heartbeats have times of the old clock
-        self._clock_offset_s = offset_s
+            self._steady_since = now  # earlier heartbeats have times of the old clock
+        if now - self._looked_at > timeout_s / 2:
+            self._steady_since = now  # what held us up, such as a slow disk, held heartbeats up too
+        self._clock_offset_s, self._looked_at = offset_s, now
         # Heartbeats could not arrive while the database was unreachable.
-        if time.monotonic() - self._steady_since > timeout_s:
+        if now - self._steady_since > timeout_s:
             for job in self._store.silent(time.time() - timeout_s):
                 reason = f"nothing was heard of its worker {job.worker} for {timeout_s:g} s"
                 # Our own workers end with their service: an earlier one began what we did not.

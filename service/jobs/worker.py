@@ -43,7 +43,7 @@ from stillpath.service.logs import configure_logging
 from stillpath.service.processes import limit_memory
 from stillpath.service.settings import Settings
 from stillpath.service.storage import Storage, StorageError, sha256_of
-from stillpath.service.storage.disk import DISK_FULL, Disk
+from stillpath.service.storage.disk import DISK_FULL, Disk, Written, written_bytes
 from stillpath.service.storage.factory import open_storage
 
 __all__ = ["Workplace", "execute", "run_compensation", "run_job"]
@@ -133,19 +133,25 @@ def execute(job_id: str, workplace: Workplace, runner: Runner) -> None:
     if job.kind is not JobKind.COMPENSATION:
         runner = run_computation
     disk = Disk(settings.data_dir, settings.disk_reserve_bytes)
+    written = Written(_place(job, workplace))
+
+    def has_room() -> bool:
+        written.look()
+        return disk.lets_jobs_go_on
+
     watch = Watch(
         store,
         job,
         limits,
         interrupted=workplace.interrupted,
-        has_room=lambda: disk.lets_jobs_go_on,
-        no_room=lambda: _no_room(job, workplace),
+        has_room=has_room,
+        no_room=lambda: _no_room(job, workplace, written),
         end=workplace.end,
     )
     with structlog.contextvars.bound_contextvars(job=job.id, attempt=job.attempt):
         log.info("job started", worker=workplace.name)
         with watch:
-            event = _attempt(job, workplace, runner, watch, limits)
+            event = _attempt(job, workplace, runner, watch, limits, written)
         # A decision of the watch that was not stored yet comes first.
         for said in (watch.verdict, event):
             if said is not None:
@@ -191,7 +197,12 @@ def run_compensation(task: Task, progress: Callable[[Progress], None]) -> dict[s
 
 
 def _attempt(
-    job: Job, workplace: Workplace, runner: Runner, watch: Watch, limits: AttemptLimits
+    job: Job,
+    workplace: Workplace,
+    runner: Runner,
+    watch: Watch,
+    limits: AttemptLimits,
+    written: Written,
 ) -> Event | None:
     """Return how the attempt ended; None if it was stopped from outside.
 
@@ -205,10 +216,10 @@ def _attempt(
                 if error.errno not in DISK_FULL:
                     raise
                 structlog.get_logger("worker").warning("no room for the job", reason=str(error))
-                # Now, while the files it has written still exist.
+                # Now, while what it has put into the folder still exists.
                 if isinstance(error, StorageError) and workplace.settings.storage_url is not None:
                     return _no_room_in_storage(job, workplace)
-                return _no_room(job, workplace)
+                return _no_room(job, workplace, written)
     except Cancelled:
         return None
     except MemoryError:
@@ -245,18 +256,18 @@ def _answers(storage: Storage) -> bool:
     return False
 
 
-def _no_room(job: Job, workplace: Workplace) -> Event:
+def _no_room(job: Job, workplace: Workplace, written: Written) -> Event:
     """Return the event for a job without disk space, by what it has written."""
     disk = Disk(workplace.settings.data_dir, workplace.settings.disk_reserve_bytes)
-    written = _written_bytes(job, workplace)
-    if disk.fits_ever(written + job.source_bytes):
-        return OutOfRoom(job.attempt, time.time(), written)
-    return Failed(job.attempt, time.time(), never_fits(written, disk.total_bytes()))
+    room_bytes = written.look()
+    if disk.fits_ever(room_bytes + job.source_bytes):
+        return OutOfRoom(job.attempt, time.time(), room_bytes)
+    return Failed(job.attempt, time.time(), never_fits(room_bytes, disk.total_bytes()))
 
 
 def _no_room_in_storage(job: Job, workplace: Workplace) -> Event:
     """Return the event for a job whose result does not fit into the storage."""
-    needed = _written_bytes(job, workplace)
+    needed = written_bytes(_place(job, workplace))
     room = None
     with contextlib.suppress(StorageError):
         stored = workplace.storage.list(f"{job.attempt_files}/")
@@ -265,14 +276,6 @@ def _no_room_in_storage(job: Job, workplace: Workplace) -> Event:
     if room is not None and needed + job.source_bytes > room.total_bytes:
         return Failed(job.attempt, time.time(), storage_never_fits(needed, room.total_bytes))
     return OutOfRoom(job.attempt, time.time(), needed)
-
-
-def _written_bytes(job: Job, workplace: Workplace) -> int:
-    written = 0
-    with contextlib.suppress(OSError):  # files may disappear meanwhile
-        for path in _place(job, workplace).rglob("*"):
-            written += path.stat().st_size
-    return written
 
 
 def _place(job: Job, workplace: Workplace) -> Path:

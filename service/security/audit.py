@@ -112,7 +112,8 @@ class AuditLog:
         what = (caller.network, caller.key_id, why)
         now = time.time()
         with self._lock:
-            if now - self._denied.get(what, 0.0) < _DENIED_SECONDS:
+            # Less than nothing where the clock was set back.
+            if 0 <= now - self._denied.get(what, 0.0) < _DENIED_SECONDS:
                 return
             self._denied[what] = now
             self._denied.move_to_end(what)

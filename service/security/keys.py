@@ -167,7 +167,8 @@ class KeyStore:
     def used(self, key: Key) -> None:
         """Note that a key was used, at most once a minute."""
         now = self._clock()
-        if key.used_at is not None and now - key.used_at < _USE_SECONDS:
+        # Less than nothing where the clock was set back.
+        if key.used_at is not None and 0 <= now - key.used_at < _USE_SECONDS:
             return
         with writing(self._engine) as connection:
             connection.execute(update(keys).where(keys.c.id == key.id).values(used_at=now))

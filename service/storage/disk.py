@@ -6,13 +6,14 @@ import contextlib
 import errno
 import os
 import shutil
+import stat
 from pathlib import Path
 
 import structlog
 
 from stillpath.service.permissions import private_folder
 
-__all__ = ["DISK_FULL", "Disk", "NoRoom"]
+__all__ = ["DISK_FULL", "Disk", "NoRoom", "Written", "written_bytes"]
 
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 """Error numbers of a full disk."""
@@ -143,3 +144,53 @@ class Disk:
         with contextlib.suppress(OSError):
             (self._folder / _BALLAST).unlink()
             structlog.get_logger("disk").warning("the disk is full; the reserve was given up")
+
+
+class Written:
+    """The most that the work in a folder has taken on the disk.
+
+    A file that is not complete has no name on Linux (`pipeline.files.replacing`), and is gone once
+    the work fails: so the folder is looked at from time to time.
+
+    Parameters
+    ----------
+    folder : Path
+        See `written_bytes`.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._most_bytes = 0
+
+    def look(self) -> int:
+        """Return the most bytes that were seen until now."""
+        self._most_bytes = max(self._most_bytes, written_bytes(self._folder))
+        return self._most_bytes
+
+
+def written_bytes(folder: Path) -> int:
+    """Return the size of the files in a folder, and of those without a name on its disk.
+
+    Parameters
+    ----------
+    folder : Path
+        Where this process writes, and no other.
+    """
+    size_bytes = 0
+    with contextlib.suppress(OSError):  # files may disappear meanwhile
+        size_bytes = _unnamed_bytes(folder.stat().st_dev)
+        for path in folder.rglob("*"):
+            size_bytes += path.stat().st_size
+    return size_bytes
+
+
+def _unnamed_bytes(device: int) -> int:
+    """Return the size of the files without a name that this process has open on a disk."""
+    sizes: dict[int, int] = {}  # a file may be open several times
+    with contextlib.suppress(FileNotFoundError):  # no Linux
+        for handle in Path("/proc/self/fd").iterdir():
+            with contextlib.suppress(OSError):  # closed meanwhile
+                status = handle.stat()
+                if stat.S_ISREG(status.st_mode) and not status.st_nlink and status.st_dev == device:
+                    sizes[status.st_ino] = status.st_size
+    return sum(sizes.values())

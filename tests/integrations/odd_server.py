@@ -3,14 +3,17 @@
 What is odd is told by the beginning of the path: /key wants the key "secret", with /short results
 break off, with /login a page comes instead of them, with /lost a part of the upload gets lost,
 /moved is somewhere else, /full takes no uploads, /busy takes each only the second time, /damaged
-has damaged results, /unreported no reports. All other paths are those of the real server.
+has damaged results, /unreported no reports, and /cut breaks each result off after a third of it.
+All other paths are those of the real server.
 """
 
 import json
 import sys
 from pathlib import Path
 
-ODDITIES = ("key", "short", "login", "lost", "moved", "full", "busy", "damaged", "unreported")
+ODDITIES = (
+    *("key", "short", "login", "lost", "moved", "full", "busy", "damaged", "unreported", "cut"),
+)
 KEYS = set()
 """Of uploads that came to /busy."""
 
@@ -55,6 +58,7 @@ class Changed:
     def __init__(self, send, path, oddity):
         self._send, self._path, self._oddity = send, path, oddity
         self._start = None
+        self._third = 0
 
     async def __call__(self, message):
         if self._oddity == "lost" and self._path == "/v1/jobs":
@@ -71,6 +75,15 @@ class Changed:
             if message["type"] == "http.response.body" and message.get("body"):
                 message = {**message, "body": message["body"][:-3], "more_body": False}
             elif message["type"] == "http.response.body":
+                return
+        if self._oddity == "cut" and self._path.endswith("/result"):
+            if message["type"] == "http.response.start":
+                headers = dict(message["headers"])
+                whole = headers.get(b"content-range", headers[b"content-length"]).split(b"/")[-1]
+                self._third = -(-int(whole) // 3)
+            elif message.get("body"):
+                message = {**message, "body": message["body"][: self._third], "more_body": False}
+            else:
                 return
         await self._send(message)
 

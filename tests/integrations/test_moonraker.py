@@ -91,6 +91,18 @@ def test_no_server(tmp_path: Path):
     with_component(tmp_path, scenario, server="http://127.0.0.1:9")
 
 
+def test_results_come_to_the_disk_of_the_files_and_not_to_tmp(tmp_path: Path):
+    script = tmp_path / "script.py"
+    script.write_text("import sys, tempfile; sys.exit(tempfile.gettempdir())\n")
+
+    async def scenario(server: Server, _: Any) -> None:
+        server.upload("part.gcode", PART)
+        job = await settled(server, "part.gcode")
+        assert job["reason"] == str(server.data / "stillpath" / "work")
+
+    with_component(tmp_path, scenario, script=str(script))
+
+
 @pytest.mark.slow
 def test_only_what_is_asked_for_when_it_is_not_automatic(tmp_path: Path, running: Running):
     async def scenario(server: Server, _: Any) -> None:

@@ -311,6 +311,12 @@ def test_broken_transfers(
     until(lambda: not running.job_ids())
 
 
+def test_a_result_that_breaks_off_goes_on(running: Running, part: Path, tmp_path: Path):
+    done = post(*running.odd("cut"), "--no-report", part, home=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert_untouched(part, DONE)
+
+
 def test_a_busy_server_is_asked_again(running: Running, part: Path, tmp_path: Path):
     done = post(*running.odd("busy"), "--no-report", part, home=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")

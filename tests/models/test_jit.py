@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import errno
 import importlib
 import os
 import subprocess
@@ -12,6 +13,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from numba.core.caching import IndexDataCacheFile
 
 from stillpath.models import jit
 
@@ -85,6 +87,24 @@ def test_a_damaged_file_is_compiled_anew(tools, suffix: str) -> None:
     third = tools(2.0, 1.0)
     assert third.outer(3.0) == 7.0
     assert sum(third.outer.stats.cache_hits.values()) == 1
+
+
+def test_code_of_earlier_sources_is_not_taken_for_what_a_full_disk_lost(
+    tools, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert tools(2.0, 1.0).outer(3.0) == 7.0
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    # The index is small, and is written first.
+    with monkeypatch.context() as disk:
+        disk.setattr(IndexDataCacheFile, "_save_data", full)
+        assert tools(5.0, 1.0).outer(3.0) == 16.0
+    assert tools(5.0, 1.0).outer(3.0) == 16.0
+    again = tools(5.0, 1.0)
+    assert again.outer(3.0) == 16.0
+    assert sum(again.outer.stats.cache_hits.values()) == 1
 
 
 def test_a_kernel_from_disk_fills_arrays_as_a_fresh_one(tools) -> None:

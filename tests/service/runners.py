@@ -13,6 +13,7 @@ from collections.abc import Callable
 from typing import Any
 
 from stillpath.gcode.errors import GcodeError
+from stillpath.pipeline.files import replacing
 from stillpath.pipeline.progress import Progress
 from stillpath.service.jobs.task import Task
 from stillpath.service.processes import METHOD
@@ -82,11 +83,13 @@ def _act(task: Task, progress: Callable[[Progress], None]) -> None:
         _grow(int(rest.split()[0]) << 20, progress)
     progress(Progress("compensating", 0.5, 10.0, 1.0, 1.0))
     stamp = "; Processed by stillpath 0 pretended\n" if "stamp" in text.split("\n")[0] else ""
-    with task.target.open("w") as file:
+    # As the pipeline does: without a name until it is complete.
+    with replacing(task.target) as temporary, temporary.open("w") as file:
         file.write(stamp + "; compensated\n" + text)
         if word == "long":
             for _ in range(int(rest.split()[0])):
                 file.write("; " + "x" * ((1 << 20) - 3) + "\n")
+                time.sleep(0.1)
                 progress(Progress("compensating", 0.6, 10.0, 1.0, 1.0))
 
 

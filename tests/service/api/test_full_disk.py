@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import shutil
 import socket
 import sys
 from collections.abc import Iterator
@@ -147,6 +148,7 @@ def test_a_job_too_large_for_the_disk_is_told_so(
         assert client.delete(where).status_code == 204
 
         # What would fit without a neighbour waits, says for how much, and holds nobody up.
+        assert until(lambda: shutil.disk_usage(small_disk).free > 40 * MIB, 60)
         foreign.write_bytes(bytes(25 * MIB))
         where = post(b"long 34").headers["location"]
         job = until(lambda: (j := client.get(where).json())["room_bytes"] and j, 60)

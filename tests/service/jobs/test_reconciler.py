@@ -101,6 +101,29 @@ def test_a_service_that_was_killed_is_no_loss_of_its_jobs(site: Site, own: bool,
     assert (job.state, job.losses) == (JobState.QUEUED, int(ours or not own))
 
 
+def test_a_disk_that_held_everybody_up_is_no_silence(site: Site, monkeypatch: pytest.MonkeyPatch):
+    """A worker's heartbeat waits for the disk as the reconciler does, and may come after it."""
+    look = looking(site, Workers())
+    look._settings = site.settings.model_copy(update={"heartbeat_timeout_s": 2.0})
+    look._tick()
+    job_id = site.submit("G1")
+    site.store.apply(job_id, Claimed(time.time(), "w"))
+    look._steady_since -= 3600.0
+    look._leased_at -= 3600.0
+
+    def slow(*_: object) -> bool:
+        time.sleep(2.5)
+        return True
+
+    with monkeypatch.context() as disk:
+        disk.setattr(site.store, "lease", slow)
+        look._tick()
+    assert site.get(job_id).state is JobState.RUNNING
+    look._steady_since -= 3600.0  # and still no heartbeat
+    look._tick()
+    assert site.get(job_id).state is JobState.QUEUED
+
+
 @pytest.mark.parametrize("away_h", [0.5, 72.0])
 @pytest.mark.parametrize("submitted_h", [0.0, 73.0])
 def test_a_print_is_not_started_days_after_it_was_expected(

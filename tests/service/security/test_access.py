@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -102,6 +104,20 @@ def test_who_was_turned_away_is_written_once_a_minute(client: TestClient):
     rows = audit(client, action="denied", limit=1000)
     assert 1 <= len([row for row in rows if row["details"]["why"].startswith("401")]) <= 2
     assert "zzz" not in str(rows)
+
+
+def test_who_is_turned_away_is_written_although_the_clock_was_set_back(
+    client: TestClient, monkeypatch: pytest.MonkeyPatch
+):
+    def turned_away() -> int:
+        assert client.get("/v1/jobs", headers={"X-Api-Key": "sp_" + "z" * 32}).status_code == 401
+        return len(audit(client, action="denied"))
+
+    ahead = SimpleNamespace(time=lambda: time.time() + 1e8)
+    with monkeypatch.context() as until_set:
+        until_set.setattr("stillpath.service.security.audit.time", ahead)
+        before = turned_away()
+    assert turned_away() == before + 1
 
 
 def test_a_whole_network_turned_away_fills_no_disk(client: TestClient):

@@ -87,6 +87,9 @@ def test_the_last_use_is_written_once_a_minute(store: KeyStore, clock: Clock):
         clock.now += 25
     start = 1_000_000.0
     assert noted == [start, start, start, start + 75, start + 75]
+    clock.now = start - 1000  # it was ahead
+    store.used(store.find(secret))
+    assert store.find(secret).used_at == start - 1000
 
 
 @pytest.mark.parametrize(
