@@ -109,9 +109,12 @@ def scan_file(
     _check_controller(controller, spec)
     sensor = _in_um(spec.sensor, scale)
     hatches = read_hatches(_text(source))
-    samples, rows = _numbered(sample_hatches(hatches, loop.dt_s, settings.timing), hatches)
-    wanted = 1e3 * samples.xy_mm
     prefilter = _Prefilter(loop, settings)
+    # A command that looks further ahead than the machine stands still would begin with a jump.
+    lead_s = max(settings.timing.lead_s, (prefilter.preview + 1) * loop.dt_s)
+    timing = replace(settings.timing, lead_s=lead_s)
+    samples, rows = _numbered(sample_hatches(hatches, loop.dt_s, timing), hatches)
+    wanted = 1e3 * samples.xy_mm
     command = np.array([prefilter.apply(axis) for axis in wanted])
     warm_up = 0 if controller is None else min(controller.settling, _LONGEST_WARM_UP)
     disturbed = _disturbance(loop, spec, settings, controller, warm_up + wanted.shape[1], scale)

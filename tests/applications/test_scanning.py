@@ -19,7 +19,7 @@ from stillpath.cli.main import run
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.feedback.preview_command import preview_command
 from stillpath.models.disturbances import Narrowband, SensorSpec, Tone
-from stillpath.models.loops import builtin_loops, load_loop
+from stillpath.models.loops import LoopSpec, builtin_loops, load_loop
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "hatch.gcode"
 SCALED = ScanSettings(um_per_unit=2500)
@@ -51,6 +51,22 @@ def test_prefilter_takes_the_lag(name: str, prefilter: str) -> None:
     assert left["sent"] > 50
     # A window's functions end at 40/64 of Nyquist: at 10 kHz and 1 m/s that rounds the line's ends.
     assert left["prefilter"] < (0.02 if prefilter == "zpetc" else 0.03) * left["sent"]
+
+
+@pytest.mark.parametrize("prefilter", ["zpetc", "fbf"])
+def test_commands_that_look_far_ahead_begin_at_rest(prefilter: str) -> None:
+    """A preview longer than 2 ms began with a jump, as large as the first move of the file."""
+    if prefilter == "fbf":
+        spec, settings = load_loop("direct-drive-table"), ScanSettings(prefilter="fbf")
+    else:
+        servo = {"kind": "servo", "num": [0, 0.1, 0.1], "den": [1, -1, 0.2], "dt_s": 1e-3}
+        spec = LoopSpec.model_validate({"name": "slow", "title": "", "unit": "mm", "loop": servo})
+        settings = ScanSettings(cutoff_hz=40.0)
+    made = scan_file(EXAMPLE, spec, settings)
+    np.testing.assert_allclose(made.command[:, 0], made.command[:, 1], atol=1e-9)
+    np.testing.assert_allclose(made.command[:, 0], 0.0, atol=1e-9)
+    left = by_name(made.report)
+    assert left["prefilter"] < (0.01 if prefilter == "fbf" else 0.5) * left["sent"]
 
 
 @pytest.mark.parametrize(("name", "cut"), [("galvo-40khz", 0.95), ("galvo-camera", 0.99)])
