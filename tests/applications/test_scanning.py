@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
+from scipy.signal import cont2discrete, lfilter
 
 from stillpath.applications.controllers.design import design_controller
 from stillpath.applications.controllers.loading import LoadedController, read_controller
@@ -18,8 +18,9 @@ from stillpath.applications.scanning.scan import ScanSettings, scan_file
 from stillpath.cli.main import run
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.feedback.preview_command import preview_command
+from stillpath.compensation.feedback.zero_phase import design_prefilter
 from stillpath.models.disturbances import Narrowband, SensorSpec, Tone
-from stillpath.models.loops import LoopSpec, builtin_loops, load_loop
+from stillpath.models.loops import Loop, LoopSpec, builtin_loops, load_loop
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "hatch.gcode"
 SCALED = ScanSettings(um_per_unit=2500)
@@ -67,6 +68,24 @@ def test_commands_that_look_far_ahead_begin_at_rest(prefilter: str) -> None:
     np.testing.assert_allclose(made.command[:, 0], 0.0, atol=1e-9)
     left = by_name(made.report)
     assert left["prefilter"] < (0.01 if prefilter == "fbf" else 0.5) * left["sent"]
+
+
+def test_a_slow_servo_sampled_fast_gets_no_alternating_command() -> None:
+    """Its zero near -1 was cancelled: 3 m of alternating command for 3 mm of path."""
+    w, dt_s = 2 * np.pi * 30.0, 5e-5
+    num, den, _ = cont2discrete(([w * w], [1, 1.4 * w, w * w]), dt_s)
+    loop = Loop(tuple(num[0].tolist()), tuple(den.tolist()), dt_s, (0.0,))
+    y_d = np.interp(np.arange(2000.0), [500, 1500], [0.0, 3.0])
+    r = design_prefilter(loop).apply(y_d)
+    np.testing.assert_allclose(np.diff(r[520:1480], 2), 0.0, atol=1e-6)
+    assert np.abs(lfilter(num[0], den, r) - y_d).max() < 0.001
+
+
+def test_a_command_far_beyond_the_path_is_noted() -> None:
+    table = scan_file(EXAMPLE, load_loop("direct-drive-table"), ScanSettings())
+    beyond = np.abs(table.command).max() - 3.0
+    assert any(f"{beyond:.3g} mm beyond the path" in note for note in table.report.notes)
+    assert not scan_file(EXAMPLE, load_loop("galvo-40khz"), SCALED).report.notes
 
 
 @pytest.mark.parametrize(("name", "cut"), [("galvo-40khz", 0.95), ("galvo-camera", 0.99)])
