@@ -185,7 +185,9 @@ class _Prefilter:
 
     def figures(self) -> dict[str, Any]:
         """Return the figures of the report."""
+        parts = () if self._filter is None else self._filter.coefficients
         return {
+            "coefficients": tuple({"name": c.name, "kind": c.kind, **c.values} for c in parts),
             "prefilter": self.label,
             "preview_samples": self.preview,
             "peak_gain": self.peak,

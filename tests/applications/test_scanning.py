@@ -7,18 +7,24 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.signal import cont2discrete, lfilter
+from scipy.signal import cont2discrete, lfilter, sosfilt
 
 from stillpath.applications.controllers.design import design_controller
 from stillpath.applications.controllers.loading import LoadedController, read_controller
 from stillpath.applications.controllers.options import read_options
 from stillpath.applications.scanning.figures import ScanReport
-from stillpath.applications.scanning.page import render_scan, worst_tracks, write_command
+from stillpath.applications.scanning.page import (
+    render_scan,
+    worst_tracks,
+    write_command,
+    write_scan,
+)
 from stillpath.applications.scanning.scan import ScanSettings, scan_file
 from stillpath.cli.main import run
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.feedback.preview_command import preview_command
 from stillpath.compensation.feedback.zero_phase import design_prefilter
+from stillpath.gcode.hatches import Timing, read_hatches, sample_hatches
 from stillpath.models.disturbances import Narrowband, SensorSpec, Tone
 from stillpath.models.loops import Loop, LoopSpec, builtin_loops, load_loop
 
@@ -188,6 +194,26 @@ def test_refusals() -> None:
     tone = Narrowband(tones=(Tone(f_hz=9000),))
     with pytest.raises(ValueError, match="half the sampling rate"):
         scan_file(EXAMPLE, spec, ScanSettings(2500, disturbance=tone))
+
+
+@pytest.mark.parametrize("cutoff_hz", [None, 500.0])
+def test_the_prefilter_can_be_loaded(cutoff_hz: float | None, tmp_path: Path) -> None:
+    """The feedforward of paper 002, from scan.json and by scipy alone, makes the same command."""
+    spec = load_loop("direct-drive-table")
+    made = scan_file(EXAMPLE, spec, ScanSettings(cutoff_hz=cutoff_hz))
+    write_scan(made.report, tmp_path)
+    parts = {c["name"]: c for c in json.loads((tmp_path / "scan.json").read_text())["coefficients"]}
+    timing = Timing(lead_s=2e-3)
+    wanted = sample_hatches(read_hatches(EXAMPLE.read_text()), spec.loop.dt_s, timing).xy_mm[0]
+    ahead, taps = parts["zpetc"]["preview"], np.array(parts["zpetc"]["taps"])
+    if cutoff_hz is not None:
+        lowpass = np.array(parts["lowpass"]["taps"])
+        ahead, taps = ahead + len(lowpass) // 2, np.convolve(taps, lowpass)
+    assert ahead == made.report.preview_samples
+    r = lfilter(taps, [1.0], np.pad(wanted, (0, ahead), mode="edge"))
+    if "inverse" in parts:
+        r = sosfilt(np.array(parts["inverse"]["rows"]), r)
+    np.testing.assert_allclose(r[ahead:], made.command[0], atol=1e-9 * np.abs(r).max())
 
 
 def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
