@@ -191,6 +191,7 @@ def invert(
     order: int = 5,
     *,
     cancel_below: float = 1.0 - NEAR_CIRCLE,
+    alternating_below: float = 1.0,
     unit_dc: bool = False,
 ) -> Inversion:
     """Design the approximate inverse `kind` of a plant.
@@ -203,6 +204,9 @@ def invert(
         n1: additional terms of ``ebzpetc`` (0 is ``zpetc``), terms of ``ts``.
     cancel_below : float
         Zeros of smaller modulus are cancelled; 0: none, as in figures 2.3 and 2.4 of paper 003.
+    alternating_below : float
+        The same for zeros of negative real part: sampling adds them near -1, and their inverse
+        alternates from sample to sample.
     unit_dc : bool
         Scale F to reach constant positions exactly, which ``ts`` alone does not do by itself:
         its truncation leaves a^-n1.
@@ -220,8 +224,8 @@ def invert(
     if np.any(np.abs(poles) >= 1):
         raise DesignError(f"{kind}: pole |z| = {np.abs(poles).max():.6g}; only stable plants")
     # Zeros at infinity of rounding size are delays, and far ones are harmless.
-    kept = zeros[np.abs(zeros) >= cancel_below]
-    cancelled = zeros[np.abs(zeros) < cancel_below]
+    limit = np.where(zeros.real < 0, min(cancel_below, alternating_below), cancel_below)
+    kept, cancelled = zeros[np.abs(zeros) >= limit], zeros[np.abs(zeros) < limit]
     for zero in kept[np.abs(kept - 1) < NEAR_CIRCLE]:
         raise DesignError(
             f"{kind}: zero z = {_number(zero)} lies at 1: the plant does not answer slow motion, "

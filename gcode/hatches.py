@@ -91,7 +91,7 @@ class Timing:
     settle_s : float
         Wait at the end of a jump.
     lead_s : float
-        Standing time before the first and after the last move.
+        Standing time before the first and after the last move, at least.
     """
 
     jump_mm_s: float = 2000.0

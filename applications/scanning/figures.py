@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from stillpath.models.document import Document
 
 __all__ = ["ScanReport", "TrackFigures", "VariantFigures"]
@@ -47,6 +49,8 @@ class ScanReport(Document):
     preview_samples: int
     peak_gain: float | None
     """Largest gain of the prefilter over frequency; None if it is no filter (fbf)."""
+    coefficients: tuple[dict[str, Any], ...]
+    """Of zpetc at the loop's rate: taps with their preview, sections, and low-pass, in series."""
     controller: str | None
     disturbance: str | None
     enters: str | None

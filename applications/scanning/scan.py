@@ -39,6 +39,8 @@ _LARGEST_FILE = 64 << 20
 _LONGEST_WARM_UP = 200_000
 _FIR_SAMPLES = 5
 _SEED = 0
+_LEAST_BEYOND = 0.1
+"""Excess of the command over the path that is noted, relative to the path's extent."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,9 +111,10 @@ def scan_file(
     _check_controller(controller, spec)
     sensor = _in_um(spec.sensor, scale)
     hatches = read_hatches(_text(source))
-    samples, rows = _numbered(sample_hatches(hatches, loop.dt_s, settings.timing), hatches)
-    wanted = 1e3 * samples.xy_mm
     prefilter = _Prefilter(loop, settings)
+    timing = prefilter.led(settings.timing)
+    samples, rows = _numbered(sample_hatches(hatches, loop.dt_s, timing), hatches)
+    wanted = 1e3 * samples.xy_mm
     command = np.array([prefilter.apply(axis) for axis in wanted])
     warm_up = 0 if controller is None else min(controller.settling, _LONGEST_WARM_UP)
     disturbed = _disturbance(loop, spec, settings, controller, warm_up + wanted.shape[1], scale)
@@ -143,7 +146,7 @@ def scan_file(
         drawn_mm=float(np.sum(np.hypot(*(hatches.end_mm - hatches.start_mm).T)[hatches.beam])),
         variants=tuple(_variant(name, *found) for name, found in errors.items()),
         tracks=_tracks(hatches, rows, {name: found for name, (_, found) in errors.items()}),
-        notes=tuple(f"{name} is not used by scanners: ignored" for name in hatches.passed_over),
+        notes=_notes(hatches, wanted, command),
     )
     return Scan(report, samples.t_s, command / scale, samples.track)
 
@@ -182,11 +185,21 @@ class _Prefilter:
 
     def figures(self) -> dict[str, Any]:
         """Return the figures of the report."""
+        parts = () if self._filter is None else self._filter.coefficients
         return {
+            "coefficients": tuple({"name": c.name, "kind": c.kind, **c.values} for c in parts),
             "prefilter": self.label,
             "preview_samples": self.preview,
             "peak_gain": self.peak,
         }
+
+    def led(self, timing: Timing) -> Timing:
+        """Let the machine stand still for as long as the command looks ahead.
+
+        Otherwise the command would begin with a jump.
+        """
+        lead_s = (self.preview + 1) * self._loop.dt_s
+        return replace(timing, lead_s=max(timing.lead_s, lead_s))
 
     def apply(self, wanted: Array) -> Array:
         if self._filter is not None:
@@ -324,6 +337,20 @@ def _disturbance(
     if rms == 0:
         raise DesignError("the controller's disturbance does not reach the output; give another")
     return _Disturbed(d * settings.disturbance_um / rms, enters, disturbance_text(kind))
+
+
+def _notes(hatches: Hatches, wanted: Array, command: Array) -> tuple[str, ...]:
+    notes = [f"{name} is not used by scanners: ignored" for name in hatches.passed_over]
+    beyond_um = np.maximum(wanted.min(1) - command.min(1), command.max(1) - wanted.max(1))
+    axis = int(np.argmax(beyond_um))
+    if beyond_um[axis] > _LEAST_BEYOND * np.ptp(wanted, axis=1).max():
+        notes.append(
+            f"the command of {'XY'[axis]} goes {1e-3 * beyond_um[axis]:.3g} mm beyond the path, "
+            f"which is {1e-3 * np.ptp(wanted[axis]):.3g} mm long: where the machine cannot follow, "
+            "the prediction is void. A lower F, slower jumps (--jump-mm-s) and a low-pass "
+            "(--cutoff-hz) make it smaller"
+        )
+    return tuple(notes)
 
 
 def _variant(name: str, label: str, found: TrackErrors) -> VariantFigures:

@@ -194,26 +194,30 @@ class Controller:
         return document
 
     def to_c_header(self) -> str:
-        """Return the coefficients as a C header (C99, no dependency).
+        """Return the difference equations as a C header (C99, no dependency).
 
-        Its comment lists the signals and the order of computation; the coefficients of every filter
-        named there are in `to_dict` under difference_equations.
+        Its comment has the equations in the order of computation, and names the constants that
+        each of them uses: these are all that a controller needs.
         """
         guard = f"STILLPATH_{_identifier(self.method)}_{_identifier(self.machine)}_H".upper()
         prefix = _identifier(self.method).lower()
+        ordered = Diagram(self.blocks).blocks
         lines = [
             f"/* {self.method} for {self.machine}: u = v - c, sampled every {self.dt_s!r} s.",
             " * r reference, ym measured output, v control without add-on, u plant input.",
-            *(f" *   {_c_comment(b)}" for b in Diagram(self.blocks).blocks),
+            " * Constants are in rising powers of z^-1; den[0] divides the others.",
+            *(f" *   {_c_comment(b, prefix)}" for b in ordered),
             " */",
             f"#ifndef {guard}",
             f"#define {guard}",
             "",
         ]
-        for part in self.coefficients:
-            lines.append(f"/* {part.name}: {part.kind} */")
-            for key, value in part.values.items():
-                lines.append(_c_definition(f"{prefix}_{part.name}_{key}", value))
+        for block in ordered:
+            lines += [
+                f"static const double {name}[{len(values)}] = "
+                f"{{{', '.join(repr(float(v)) for v in values)}}};"
+                for name, values in _c_constants(block, prefix).items()
+            ]
         return "\n".join([*lines, "", f"#endif /* {guard} */", ""])
 
 
@@ -348,29 +352,26 @@ def _equation(block: Block) -> dict[str, object]:
     }
 
 
-def _c_comment(block: Block) -> str:
-    """Describe a block: output = H(z) (sum of signals), and its rate."""
+def _c_comment(block: Block, prefix: str) -> str:
+    """Describe a block: output = num/den (sum of signals), and when it runs."""
     wires = " ".join(f"{gain:+.17g} {name}" for name, gain in block.inputs)
-    plain = block.order == 0 and block.num == block.den == (1.0,)
-    through = f"({wires})" if plain else f"H[{len(block.num)}/{len(block.den)}] ({wires})"
+    through = "/".join(_c_constants(block, prefix))
     late = f", {block.delay} runs late" if block.delay else ""
-    when = f", at n mod {block.every} = {block.phase}" if block.every > 1 else ""
-    return f"{block.output} = {through}{late}{when}"
+    between = ", 0 at the others" if block.zero_between else ""
+    when = f", at n mod {block.every} = {block.phase}{between}" if block.every > 1 else ""
+    return f"{block.output} = {f'{through} ' if through else ''}({wires}){late}{when}"
+
+
+def _c_constants(block: Block, prefix: str) -> dict[str, tuple[float, ...]]:
+    """Return the polynomials of a block by the names of their constants; none where it is 1."""
+    turn = f"_{block.phase}" if block.phase else ""
+    parts = {"num": block.num, "den": block.den}
+    return {
+        f"{prefix}_{block.output}{turn}_{part}": values
+        for part, values in parts.items()
+        if (block.num, block.den) != ((1.0,), (1.0,))
+    }
 
 
 def _identifier(text: str) -> str:
     return "".join(ch if ch.isalnum() and ch.isascii() else "_" for ch in text)
-
-
-def _c_definition(name: str, value: Values) -> str:
-    if isinstance(value, int):
-        return f"enum {{ {name} = {value} }};"
-    if isinstance(value, float):
-        return f"static const double {name} = {float(value)!r};"
-    if value and isinstance(value[0], tuple):
-        rows = [row for row in value if isinstance(row, tuple)]
-        inner = ",\n  ".join("{" + ", ".join(repr(float(v)) for v in row) + "}" for row in rows)
-        return f"static const double {name}[{len(rows)}][{len(rows[0])}] = {{\n  {inner}}};"
-    numbers = [v for v in value if not isinstance(v, tuple)]
-    listed = ", ".join(repr(float(v)) for v in numbers)
-    return f"static const double {name}[{len(numbers)}] = {{{listed}}};"

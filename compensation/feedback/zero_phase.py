@@ -24,6 +24,9 @@ from stillpath.models.plants import DiscretePlant, balanced_discrete
 __all__ = ["Prefilter", "design_prefilter", "reference_plant"]
 
 _PREVIEW = 5
+_ALTERNATING = 0.95
+"""Zeros nearer to -1 are not cancelled (the paper's "at or near -1"): a slow servo that is sampled
+fast has one, and metres of command would answer a path of millimetres."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,7 +109,9 @@ def design_prefilter(
     if length < 1:
         raise DesignError(f"low-pass that looks {length} samples ahead; at least 1 is needed")
     # A reference has physical units: the inverse must have exact DC gain.
-    inversion = invert("zpetc", reference_plant(loop), order=0, unit_dc=True)
+    inversion = invert(
+        "zpetc", reference_plant(loop), order=0, alternating_below=_ALTERNATING, unit_dc=True
+    )
     fir = None if cutoff_hz is None else zero_phase_fir(cutoff_hz, loop.dt_s, length)
     return Prefilter(inversion, fir, loop.dt_s)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
@@ -131,6 +132,54 @@ def test_the_file_is_all_a_controller_needs(index: int, tmp_path: Path) -> None:
     scale = np.abs(run_of["c"]).max()
     assert scale > 0
     np.testing.assert_allclose(replay(equations, signals), run_of["c"], atol=1e-9 * scale)
+
+
+def equations_of(header: str) -> list[dict[str, Any]]:
+    """The difference equations that a C header describes, from its text alone."""
+    constants = {
+        name: [float(v) for v in values.split(",")]
+        for name, values in re.findall(r"double (\w+)\[\d+\] = {(.*)};", header)
+    }
+    found = []
+    for line in re.findall(r"^ \*   (.*)$", header, re.MULTILINE):
+        output, through, wires, when = re.fullmatch(r"(\w+) = (\S*) ?\((.*)\)(.*)", line).groups()
+        num, den = through.split("/") if through else ("1", "1")
+        late = re.search(r"(\d+) runs late", when)
+        turn = re.search(r"n mod (\d+) = (\d+)", when)
+        every, phase = (int(v) for v in turn.groups()) if turn else (1, 0)
+        found.append(
+            {
+                "output": output,
+                "inputs": [(n, float(g)) for g, n in re.findall(r"(\S+) (\w+)", wires)],
+                "num": constants.get(num, [1.0]),
+                "den": constants.get(den, [1.0]),
+                "delay": int(late[1]) if late else 0,
+                "every": every,
+                "phase": phase,
+                "zero_between": "0 at the others" in when,
+            }
+        )
+    return found
+
+
+DETUNED = ("galvo-10khz", {"method": "fmsdob", "targets_hz": [500, 1500], "detuning": 0.8})
+TABLE = ("direct-drive-table", {"method": "fmsdob", "targets_hz": [120], "bandwidth_hz": 10})
+
+
+@pytest.mark.parametrize(("name", "document"), [*CASES, DETUNED, TABLE])
+def test_the_c_header_is_all_a_controller_needs(name: str, document: dict[str, Any]) -> None:
+    spec = load_loop(name)
+    made = design_controller(spec, read_options(document)).controller
+    every = round(spec.loop.dt_s / made.dt_s)
+    generator = np.random.default_rng(1)
+    inputs = {s: np.repeat(generator.normal(size=2000), every) for s in ("r", "d_in", "d_out")}
+    watch = ("ym", "u", "v", "c")
+    loop = spec.nominal()
+    signals = inputs | simulate(loop, made.blocks, inputs, watch, every=every, sensor=spec.sensor)
+    c = signals["c"]
+    assert np.abs(c).max() > 0
+    found = replay(equations_of(made.to_c_header()), signals)
+    np.testing.assert_allclose(found, c, atol=1e-9 * np.abs(c).max())
 
 
 def test_page_holds_everything_itself(tmp_path: Path) -> None:

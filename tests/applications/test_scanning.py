@@ -7,19 +7,26 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
+from scipy.signal import cont2discrete, lfilter, sosfilt
 
 from stillpath.applications.controllers.design import design_controller
 from stillpath.applications.controllers.loading import LoadedController, read_controller
 from stillpath.applications.controllers.options import read_options
 from stillpath.applications.scanning.figures import ScanReport
-from stillpath.applications.scanning.page import render_scan, worst_tracks, write_command
+from stillpath.applications.scanning.page import (
+    render_scan,
+    worst_tracks,
+    write_command,
+    write_scan,
+)
 from stillpath.applications.scanning.scan import ScanSettings, scan_file
 from stillpath.cli.main import run
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.feedback.preview_command import preview_command
+from stillpath.compensation.feedback.zero_phase import design_prefilter
+from stillpath.gcode.hatches import Timing, read_hatches, sample_hatches
 from stillpath.models.disturbances import Narrowband, SensorSpec, Tone
-from stillpath.models.loops import builtin_loops, load_loop
+from stillpath.models.loops import Loop, LoopSpec, builtin_loops, load_loop
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "hatch.gcode"
 SCALED = ScanSettings(um_per_unit=2500)
@@ -51,6 +58,40 @@ def test_prefilter_takes_the_lag(name: str, prefilter: str) -> None:
     assert left["sent"] > 50
     # A window's functions end at 40/64 of Nyquist: at 10 kHz and 1 m/s that rounds the line's ends.
     assert left["prefilter"] < (0.02 if prefilter == "zpetc" else 0.03) * left["sent"]
+
+
+@pytest.mark.parametrize("prefilter", ["zpetc", "fbf"])
+def test_commands_that_look_far_ahead_begin_at_rest(prefilter: str) -> None:
+    """A preview longer than 2 ms began with a jump, as large as the first move of the file."""
+    if prefilter == "fbf":
+        spec, settings = load_loop("direct-drive-table"), ScanSettings(prefilter="fbf")
+    else:
+        servo = {"kind": "servo", "num": [0, 0.1, 0.1], "den": [1, -1, 0.2], "dt_s": 1e-3}
+        spec = LoopSpec.model_validate({"name": "slow", "title": "", "unit": "mm", "loop": servo})
+        settings = ScanSettings(cutoff_hz=40.0)
+    made = scan_file(EXAMPLE, spec, settings)
+    np.testing.assert_allclose(made.command[:, 0], made.command[:, 1], atol=1e-9)
+    np.testing.assert_allclose(made.command[:, 0], 0.0, atol=1e-9)
+    left = by_name(made.report)
+    assert left["prefilter"] < (0.01 if prefilter == "fbf" else 0.5) * left["sent"]
+
+
+def test_a_slow_servo_sampled_fast_gets_no_alternating_command() -> None:
+    """Its zero near -1 was cancelled: 3 m of alternating command for 3 mm of path."""
+    w, dt_s = 2 * np.pi * 30.0, 5e-5
+    num, den, _ = cont2discrete(([w * w], [1, 1.4 * w, w * w]), dt_s)
+    loop = Loop(tuple(num[0].tolist()), tuple(den.tolist()), dt_s, (0.0,))
+    y_d = np.interp(np.arange(2000.0), [500, 1500], [0.0, 3.0])
+    r = design_prefilter(loop).apply(y_d)
+    np.testing.assert_allclose(np.diff(r[520:1480], 2), 0.0, atol=1e-6)
+    assert np.abs(lfilter(num[0], den, r) - y_d).max() < 0.001
+
+
+def test_a_command_far_beyond_the_path_is_noted() -> None:
+    table = scan_file(EXAMPLE, load_loop("direct-drive-table"), ScanSettings())
+    beyond = np.abs(table.command).max() - 3.0
+    assert any(f"{beyond:.3g} mm beyond the path" in note for note in table.report.notes)
+    assert not scan_file(EXAMPLE, load_loop("galvo-40khz"), SCALED).report.notes
 
 
 @pytest.mark.parametrize(("name", "cut"), [("galvo-40khz", 0.95), ("galvo-camera", 0.99)])
@@ -153,6 +194,26 @@ def test_refusals() -> None:
     tone = Narrowband(tones=(Tone(f_hz=9000),))
     with pytest.raises(ValueError, match="half the sampling rate"):
         scan_file(EXAMPLE, spec, ScanSettings(2500, disturbance=tone))
+
+
+@pytest.mark.parametrize("cutoff_hz", [None, 500.0])
+def test_the_prefilter_can_be_loaded(cutoff_hz: float | None, tmp_path: Path) -> None:
+    """The feedforward of paper 002, from scan.json and by scipy alone, makes the same command."""
+    spec = load_loop("direct-drive-table")
+    made = scan_file(EXAMPLE, spec, ScanSettings(cutoff_hz=cutoff_hz))
+    write_scan(made.report, tmp_path)
+    parts = {c["name"]: c for c in json.loads((tmp_path / "scan.json").read_text())["coefficients"]}
+    timing = Timing(lead_s=2e-3)
+    wanted = sample_hatches(read_hatches(EXAMPLE.read_text()), spec.loop.dt_s, timing).xy_mm[0]
+    ahead, taps = parts["zpetc"]["preview"], np.array(parts["zpetc"]["taps"])
+    if cutoff_hz is not None:
+        lowpass = np.array(parts["lowpass"]["taps"])
+        ahead, taps = ahead + len(lowpass) // 2, np.convolve(taps, lowpass)
+    assert ahead == made.report.preview_samples
+    r = lfilter(taps, [1.0], np.pad(wanted, (0, ahead), mode="edge"))
+    if "inverse" in parts:
+        r = sosfilt(np.array(parts["inverse"]["rows"]), r)
+    np.testing.assert_allclose(r[ahead:], made.command[0], atol=1e-9 * np.abs(r).max())
 
 
 def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -315,7 +315,7 @@ def test_documents() -> None:
     assert made.to_dict() == fmsdob(SLOW.loops(), [1500.0]).to_dict()
     assert made.multiplications == sum(b.multiplications for b in made.blocks)
     header = made.to_c_header()
-    q = [float(v) for v in header.split("fmsdob_q_taps[2] = {")[1].split("}")[0].split(",")]
+    q = [float(v) for v in header.split("fmsdob_c_num[2] = {")[1].split("}")[0].split(",")]
     assert q == list(design_q(SLOW.nominal(), [1500.0]).taps)
     assert header.count("#ifndef") == header.count("#endif") == 1
     numpy_numbers = fmsdob([replace(SLOW.nominal(), dt_s=np.float64(1e-4))], [1500.0])
