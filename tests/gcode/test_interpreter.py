@@ -261,6 +261,7 @@ def test_classes(wary_machine: Machine) -> None:
         "M400": EventKind.STOP,
         "M119": EventKind.STOP,
         "QUERY_ENDSTOPS": EventKind.STOP,
+        "SET_SERVO SERVO=brush ANGLE=30": EventKind.STOP,
         "M109 S200": EventKind.STOP,
         "TEMPERATURE_WAIT SENSOR=extruder MINIMUM=5": EventKind.STOP,
         "G4 P200": EventKind.STOP,
