@@ -116,8 +116,8 @@ def test_the_host_plans_what_we_read_back(name: str, file: str, tmp_path: Path) 
 def test_the_host_stands_for_the_smooth_time_of_pressure_advance(tmp_path: Path) -> None:
     machine = of_the_package(homed(load_machine("ender3")))
     text = "G28\nG90\nM83\nG1 X10 Y10 Z5 F3000\n"
-    # The package's host is older and stands for lines that change nothing, too.
-    changes = ("ADVANCE=.05", "SMOOTH_TIME=.1", "ADVANCE=0 EXTRUDER=extruder")
+    # The package's host is older and stands for another value of the advance, too.
+    changes = ("ADVANCE=.05", "ADVANCE=.06", "SMOOTH_TIME=.1", "ADVANCE=0 EXTRUDER=extruder")
     for k, change in enumerate(changes):
         text += f"G1 X{20 + 10 * k} E1\nSET_PRESSURE_ADVANCE {change}\n"
     text += "G1 X100 E1\n"
