@@ -9,6 +9,7 @@ from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.types import EventKind, ProgramBlock
+from stillpath.models.firmware.klipper import PlannerLimits
 from stillpath.models.machine import Machine
 from tests.gcode.cutting import blocks_of
 
@@ -261,6 +262,7 @@ def test_classes(wary_machine: Machine) -> None:
         "M400": EventKind.STOP,
         "M119": EventKind.STOP,
         "QUERY_ENDSTOPS": EventKind.STOP,
+        "SET_SERVO SERVO=brush ANGLE=30": EventKind.STOP,
         "M109 S200": EventKind.STOP,
         "TEMPERATURE_WAIT SENSOR=extruder MINIMUM=5": EventKind.STOP,
         "G4 P200": EventKind.STOP,
@@ -323,8 +325,16 @@ def test_klipper_stands_where_pressure_advance_averages_over_another_time(
     assert block.events.dwell_s[0] == pytest.approx(dwell_s or 0.0)
 
 
-def test_older_klippers_stand_at_every_pressure_advance(golden_machine: Machine) -> None:
-    told = {"stopping_macros": ("set_pressure_advance",)}
+@pytest.mark.parametrize(
+    "told",
+    [
+        {"stopping_macros": ("set_pressure_advance",)},
+        {"planner": PlannerLimits(max_accel_to_decel_mm_s2=1500.0)},
+    ],
+)
+def test_older_klippers_stand_at_every_pressure_advance(
+    told: dict[str, object], golden_machine: Machine
+) -> None:
     firmware = golden_machine.firmware.model_copy(update=told)
     facts = {"firmware": firmware, "pressure_advance_s": 0.05}
     block = run("SET_PRESSURE_ADVANCE ADVANCE=.07\n", golden_machine.model_copy(update=facts))

@@ -116,8 +116,8 @@ def test_the_host_plans_what_we_read_back(name: str, file: str, tmp_path: Path) 
 def test_the_host_stands_for_the_smooth_time_of_pressure_advance(tmp_path: Path) -> None:
     machine = of_the_package(homed(load_machine("ender3")))
     text = "G28\nG90\nM83\nG1 X10 Y10 Z5 F3000\n"
-    # The package's host is older and stands for lines that change nothing, too.
-    changes = ("ADVANCE=.05", "SMOOTH_TIME=.1", "ADVANCE=0 EXTRUDER=extruder")
+    # The package's host is older and stands for another value of the advance, too.
+    changes = ("ADVANCE=.05", "ADVANCE=.06", "SMOOTH_TIME=.1", "ADVANCE=0 EXTRUDER=extruder")
     for k, change in enumerate(changes):
         text += f"G1 X{20 + 10 * k} E1\nSET_PRESSURE_ADVANCE {change}\n"
     text += "G1 X100 E1\n"
@@ -148,11 +148,11 @@ def test_the_host_of_before_the_cruise_ratio(tmp_path: Path) -> None:
     assert compared(text, newer, recorded(tmp_path)).largest["cruise speed"] > 0.05
 
 
-@pytest.mark.parametrize("line", ["M119", "QUERY_ENDSTOPS"])
-def test_the_host_brakes_to_ask_the_endstops(line: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("line", ["M119", "QUERY_ENDSTOPS", "SET_SERVO SERVO=brush ANGLE=30"])
+def test_the_host_brakes_for_it(line: str, tmp_path: Path) -> None:
     machine = of_the_package(homed(load_machine("ender3")))
     text = f"G28\nG90\nM83\nG1 X10 Y10 Z5 F3000\nG1 X50 E1\n{line}\nG1 X90 E1\n"
-    run(text, machine, tmp_path)
+    steps_of(text, printer_cfg(machine, "[servo brush]\npin: P27"), tmp_path)
     assert max(compared(text, machine, recorded(tmp_path)).largest.values()) < 1e-6
 
 

@@ -90,12 +90,13 @@ NATIVE: dict[str, Word] = {
         "SET_HEATER_TEMPERATURE TURN_OFF_HEATERS SET_TEMPERATURE_FAN_TARGET SET_FAN_SPEED "
         "SET_PIN SET_LED SET_LED_TEMPLATE SET_PRINT_STATS_INFO "
         "SET_GCODE_VARIABLE SAVE_VARIABLE EXCLUDE_OBJECT_DEFINE "
-        "SET_SERVO BED_MESH_OUTPUT BED_MESH_MAP",
+        "BED_MESH_OUTPUT BED_MESH_MAP",
         EventKind.HARMLESS,
     ),
-    # Come to rest, wait, go on from the same place.
+    # Come to rest, wait, go on from the same place. SET_SERVO asked for the time of the last move
+    # until 2024-07-30, as it does in most vendors' versions (klippy/extras/servo.py).
     **words(
-        "M400 M109 M119 M190 M191 TEMPERATURE_WAIT QUERY_ENDSTOPS ACCELEROMETER_MEASURE",
+        "M400 M109 M119 M190 M191 TEMPERATURE_WAIT QUERY_ENDSTOPS ACCELEROMETER_MEASURE SET_SERVO",
         EventKind.STOP,
     ),
     # Homing, probing, motors off, transforms, other tools: the place or the state is lost.

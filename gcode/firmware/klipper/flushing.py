@@ -4,7 +4,8 @@ Steps are generated ahead of their motion, by the look-ahead of input shaper and
 SET_INPUT_SHAPER flushes them all: the next move starts later by the look-ahead before the command
 plus that after it. So does a SET_PRESSURE_ADVANCE that changes the time over which the extruder's
 speed is averaged, which is 0 without pressure advance. Klipper before 2025-09-03, and Kalico, flush
-for every SET_PRESSURE_ADVANCE: their machines name it among their ``stopping_macros``.
+for every SET_PRESSURE_ADVANCE: their machines name it among their ``stopping_macros``, or have a
+``max_accel_to_decel_mm_s2``, which only a Klipper before 2024-03 has.
 
 Sources: klippy/toolhead.py (flush_step_generation, _calc_print_time), klippy/extras/
 motion_queuing.py, klippy/extras/input_shaper.py, klippy/kinematics/extruder.py
@@ -57,8 +58,7 @@ def pressure_advance(state: MachineState, command: Command) -> int:
     for key in ("ADVANCE", "SMOOTH_TIME"):
         if key in given:
             state.factors[f"{key} {extruder}"] = _number(given[key])
-    always = command.name in map(str.upper, state.firmware.stopping_macros)
-    if _extruder_smooth_s(state, extruder) == smooth_s and not always:
+    if _extruder_smooth_s(state, extruder) == smooth_s and not _always_stops(state, command):
         if again and state.i[at.I_KNOWN] & 3 == 3:
             state.warn(_MAY_STOP)
         return state.event(EventKind.HARMLESS)
@@ -80,6 +80,14 @@ def shaper(state: MachineState, command: Command) -> int:
         state.factors[f"f_hz {axis}"] = f_hz
         state.factors[f"damping {axis}"] = damping
     return state.event(EventKind.SHAPER, before_s + _ahead_s(state))
+
+
+def _always_stops(state: MachineState, command: Command) -> bool:
+    """Return whether the machine's Klipper flushes even if nothing changes."""
+    firmware = state.firmware
+    if isinstance(firmware, Klipper) and firmware.planner.max_accel_to_decel_mm_s2 is not None:
+        return True
+    return command.name in map(str.upper, firmware.stopping_macros)
 
 
 def _ahead_s(state: MachineState) -> float:
