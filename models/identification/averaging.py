@@ -17,6 +17,10 @@ _COHERENT = 0.95
 _DELAYS_S = 20e-3
 _FLAT = 0.2
 """Logarithm of the modulus that a mode must add before its phase counts."""
+_BELOW_PEAK, _AGREES = 0.7, 0.8
+"""Share of the frequency of the highest peak below which phases should agree with a delay, and how
+well, 0 to 1."""
+_SEARCH_S, _SEARCH_STEP_S = 0.02, 0.25e-3
 
 
 def mean_response(responses: Sequence[FrequencyResponse]) -> FrequencyResponse:
@@ -134,14 +138,32 @@ def aligned_to(response: FrequencyResponse, reference: FrequencyResponse) -> Fre
 def low_frequency_delay(f_hz: Array, response: Complex) -> float:
     """Return the delay [s] from the slope of the phase where the modulus is still flat.
 
-    There the modes add little, each only 2 zeta/w.
+    There the modes add little, each only 2 zeta/w. Where a frame on its feet shakes there, its
+    flanks turn the phase by as much as tens of milliseconds would: then the delay with which most
+    frequencies below the highest peak agree.
     """
     size = np.abs(response)
     leaves = np.abs(np.log(size / np.median(size[:3]))) > _FLAT
     few = max(6, int(np.argmax(leaves)) if leaves.any() else len(size))
     phase = np.unwrap(np.angle(response[:few]))
     slope = np.polyfit(f_hz[:few], phase, 1)[0] if len(phase) > 1 else 0.0
-    return float(-slope / (2 * np.pi))
+    delay_s = float(-slope / (2 * np.pi))
+    below = f_hz < _BELOW_PEAK * f_hz[np.argmax(size)]
+    if np.count_nonzero(below) <= few:
+        return delay_s
+    w = 2 * np.pi * f_hz[below]
+    alike = np.exp(1j * np.angle(response[below]))
+
+    def agreement(delays_s: Array) -> Array:
+        return np.asarray(np.abs(np.exp(1j * np.outer(delays_s, w)) @ alike) / len(w), np.float64)
+
+    if agreement(np.array([delay_s]))[0] >= _AGREES:
+        return delay_s
+    # Most steps are beside the flanks.
+    rises = np.diff(w) > 0.0
+    steps_s = -np.diff(np.unwrap(np.angle(alike)))[rises] / np.diff(w)[rises]
+    tried_s = float(np.median(steps_s)) + np.arange(-_SEARCH_S, _SEARCH_S, _SEARCH_STEP_S)
+    return float(tried_s[np.argmax(agreement(tried_s))])
 
 
 def on_grid(response: FrequencyResponse, f_hz: Array) -> FrequencyResponse:
