@@ -367,7 +367,7 @@ def from_config(
         machine,
         author=who(by),
         message=f"from {file.name}; plants typed in",
-        sources=[source_file(file.name, file.read_bytes())],
+        sources=[source_file(read.name, read.read_bytes()) for read in (file, *config.included)],
         expected=0,
     )
     print_revision(revision)

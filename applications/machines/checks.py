@@ -247,9 +247,10 @@ def _check_shaper(config: PrinterConfig) -> None:
 
 
 def not_followed(config: PrinterConfig) -> list[str]:
-    """Return a warning for each included file, as these are not read."""
+    """Return a warning for each included file that was not found."""
     return [
-        f"[include {name}] in {config.name}: not followed; its contents were not checked"
+        f"[include {name}] in {config.name}: not read, for it is not beside it; what it says, "
+        "macros too, is unknown"
         for name in config.includes
     ]
 

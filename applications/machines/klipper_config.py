@@ -1,4 +1,4 @@
-"""Read the motion settings of a Klipper printer.cfg; includes are not followed.
+"""Read the motion settings of a Klipper printer.cfg and of the files that it includes.
 
 Rules and defaults are those of klippy/configfile.py, toolhead.py, kinematics/extruder.py,
 extras/input_shaper.py, firmware_retraction.py and gcode_arcs.py (2024 to 2026).
@@ -6,6 +6,7 @@ extras/input_shaper.py, firmware_retraction.py and gcode_arcs.py (2024 to 2026).
 
 from __future__ import annotations
 
+import glob
 import math
 import re
 from dataclasses import dataclass, field
@@ -30,6 +31,7 @@ _CAPS = "max_velocity_silent"
 """An option of Elegoo's Centauri Carbon, where SET_VELOCITY_LIMIT and M204 stop at printer.cfg's
 limits (elegooofficial/CentauriCarbon, firmware/core/klippy/toolhead.cpp, 2025-09)."""
 _LARGEST_BYTES = 4_000_000
+_MOST_FILES = 500
 _SAVED_PREFIX = "#*# "
 _SECTION = re.compile(r"\[(?P<name>[^]]+)\]\s*$")
 _OPTION = re.compile(r"(?P<name>[^\s:=][^:=]*)[:=]\s*(?P<value>.*)$")
@@ -37,10 +39,11 @@ _COMMENT = re.compile(r"#.*$|(?:^|\s);.*$")
 
 
 class Option(NamedTuple):
-    """Text of an option and its line."""
+    """Text of an option, its line, and the file of that if it was included."""
 
     value: str
     line: int
+    file: str = ""
 
 
 _Sections: TypeAlias = dict[str, dict[str, Option]]
@@ -53,12 +56,15 @@ class PrinterConfig:
     Attributes
     ----------
     includes : tuple of str
-        Included files, which were not read, so that their contents are unknown.
+        Included files that were not found, so that their contents are unknown.
+    included : tuple of Path
+        Included files that were read.
     """
 
     name: str
     sections: _Sections = field(default_factory=dict)
     includes: tuple[str, ...] = ()
+    included: tuple[Path, ...] = ()
 
     def text(self, section: str, option: str, default: str | None = None) -> str | None:
         """Return an option as text, or the default."""
@@ -86,8 +92,8 @@ class PrinterConfig:
             value = math.nan
         if not math.isfinite(value):
             raise ModelError(
-                f"{self.name} line {found.line}: [{section}] {option}: {found.value!r:.60} is no "
-                "number"
+                f"{found.file or self.name} line {found.line}: [{section}] {option}: "
+                f"{found.value!r:.60} is no number"
             )
         return value
 
@@ -95,9 +101,9 @@ class PrinterConfig:
         """Return a number that must be there and above 0."""
         value = self.number(section, option)
         if value <= 0.0:
-            line = self.sections[section][option].line
+            _, line, file = self.sections[section][option]
             raise ModelError(
-                f"{self.name} line {line}: [{section}] {option}: {value:g} must be above 0"
+                f"{file or self.name} line {line}: [{section}] {option}: {value:g} must be above 0"
             )
         return value
 
@@ -113,82 +119,121 @@ class Fact(NamedTuple):
 
 
 def read_printer_config(path: Path) -> PrinterConfig:
-    """Read a printer.cfg with its SAVE_CONFIG block.
+    """Read a printer.cfg with its SAVE_CONFIG block and what it includes.
 
     As in Klipper, a later option wins over an earlier one, and one of the file's own over the
-    same in the block.
+    same in the block; the name of an included file may be a pattern, and counts from the folder of
+    the file that includes it.
 
     Raises
     ------
     ModelError
-        If the file cannot be read or is no configuration.
+        If a file cannot be read, is no configuration, or includes itself.
     """
-    content = read_bytes(path, _LARGEST_BYTES, "not a printer.cfg")
-    return parse_printer_config(as_utf8(content).decode(errors="replace"), path.name)
+    return _whole(_Reader(path.name), _text_of(path), path)
 
 
 def parse_printer_config(
     text: str, name: str, wanted: str = "Klipper's printer.cfg"
 ) -> PrinterConfig:
-    """Return what `read_printer_config` does, of the text of a file called `name`.
+    """Return what `read_printer_config` does, of the text of a file called `name`, alone.
 
     An error asks for what is `wanted`.
     """
-    lines = text.removeprefix("\ufeff").splitlines()
-    own, includes = _parse(lines, saved=False)
-    saved, _ = _parse(lines, saved=True)
-    if not own:
-        elsewhere = _elsewhere(includes) if includes else f"; give {wanted}"
-        raise ModelError(f"{name}: no [section] in it{elsewhere}")
-    sections = {
-        name: saved.get(name, {}) | own.get(name, {}) for name in dict.fromkeys([*own, *saved])
-    }
-    return PrinterConfig(name, sections, includes)
+    return _whole(_Reader(name), text, None, wanted)
 
 
 def facts(config: PrinterConfig) -> list[Fact]:
     """Return the facts of a configuration, with Klipper's defaults for missing ones.
 
-    If other files are included, sections that are missing altogether yield no facts.
+    If an included file was not found, sections that are missing altogether yield no facts.
     """
     known = [_printer, _travel, _extruder, _shaper, _retraction, _arcs, _macros]
     return [fact for find in known for fact in find(config)]
 
 
-def _parse(
-    lines: list[str], *, saved: bool
-) -> tuple[dict[str, dict[str, Option]], tuple[str, ...]]:
-    """Return sections and includes of the file itself, or of its SAVE_CONFIG block."""
-    sections: _Sections = {}
-    includes: list[str] = []
-    current: dict[str, Option] = {}
-    begun = ""
-    begun_at: int | None = None  # indentation of the option that deeper lines go on with
-    for number, full in enumerate(lines, 1):
-        if full.startswith("#*#") is not saved:
-            continue
-        indented = _COMMENT.sub("", full[len(_SAVED_PREFIX) :] if saved else full).rstrip()
-        line = indented.lstrip()
-        indent = len(indented) - len(line)
-        if not line:
-            continue
-        if begun_at is not None and indent > begun_at:
-            # Numbers have one line, which may be the next; more of macros and lists is not needed.
-            if not current[begun].value:
-                current[begun] = Option(line, number)
-            continue
-        begun_at = None
-        if section := _SECTION.match(line):
-            name = section["name"].strip()
-            if name.startswith("include "):
-                includes.append(name[len("include ") :].strip())
-            else:
-                current = sections.setdefault(name.lower(), {})
-        elif option := _OPTION.match(line):
-            begun = option["name"].strip().lower()
-            current[begun] = Option(option["value"], number)
-            begun_at = indent
-    return sections, tuple(includes)
+def _text_of(path: Path) -> str:
+    content = read_bytes(path, _LARGEST_BYTES, "not a printer.cfg")
+    return as_utf8(content).decode(errors="replace").removeprefix("\ufeff")
+
+
+def _whole(
+    reader: _Reader, text: str, path: Path | None, wanted: str = "Klipper's printer.cfg"
+) -> PrinterConfig:
+    """Return a configuration of the text of a file; without its path nothing included is read."""
+    lines = text.removeprefix("\ufeff").splitlines()
+    reader.read(lines, [] if path is None else [path.absolute()])
+    own, includes = reader.sections, tuple(reader.missing)
+    if not own:
+        elsewhere = _elsewhere(includes) if includes else f"; give {wanted}"
+        raise ModelError(f"{reader.name}: no [section] in it{elsewhere}")
+    block = _Reader(reader.name, saved=True)
+    block.read(lines, [])
+    names = dict.fromkeys([*own, *block.sections])
+    sections = {name: block.sections.get(name, {}) | own.get(name, {}) for name in names}
+    return PrinterConfig(reader.name, sections, includes, tuple(reader.included))
+
+
+@dataclass(slots=True)
+class _Reader:
+    """Reads a configuration and what it includes, or with `saved` its SAVE_CONFIG block."""
+
+    name: str
+    saved: bool = False
+    sections: _Sections = field(default_factory=dict)
+    missing: list[str] = field(default_factory=list)
+    included: list[Path] = field(default_factory=list)
+
+    def read(self, lines: list[str], within: list[Path]) -> None:
+        """Add the lines of the last file of `within`, which the others include in turn."""
+        file = within[-1].name if len(within) > 1 else ""
+        current: dict[str, Option] = {}
+        begun = ""
+        begun_at: int | None = None  # indentation of the option that deeper lines go on with
+        for number, full in enumerate(lines, 1):
+            if full.startswith("#*#") is not self.saved:
+                continue
+            text = full[len(_SAVED_PREFIX) :] if self.saved else full
+            indented = _COMMENT.sub("", text).rstrip()
+            line = indented.lstrip()
+            indent = len(indented) - len(line)
+            if not line:
+                continue
+            if begun_at is not None and indent > begun_at:
+                # Numbers have one line, which may be the next; more of macros and lists is not
+                # needed.
+                if not current[begun].value:
+                    current[begun] = Option(line, number, file)
+                continue
+            begun_at = None
+            if section := _SECTION.match(line):
+                name = section["name"].strip()
+                if name.startswith("include "):
+                    self._include(name[len("include ") :].strip(), within)
+                else:
+                    current = self.sections.setdefault(name.lower(), {})
+            elif option := _OPTION.match(line):
+                begun = option["name"].strip().lower()
+                current[begun] = Option(option["value"], number, file)
+                begun_at = indent
+
+    def _include(self, name: str, within: list[Path]) -> None:
+        """Read the files of an [include], in the order of their names."""
+        found: list[str] = []
+        if within:
+            pattern = Path(glob.escape(str(within[-1].parent))) / name
+            found = sorted(glob.glob(str(pattern)))  # noqa: PTH207 (hidden ones do not match)
+        files = [file for file in map(Path, found) if file.is_file()]
+        if not files:
+            self.missing.append(name)
+        for file in files:
+            if file in within or len(self.included) == _MOST_FILES:
+                raise ModelError(
+                    f"{self.name}: [include {name}] in {within[-1].name} includes itself, or more "
+                    f"than {_MOST_FILES} files are included; Klipper does not start with it"
+                )
+            self.included.append(file)
+            self.read(_text_of(file).splitlines(), [*within, file])
 
 
 def _printer(config: PrinterConfig) -> list[Fact]:
@@ -362,8 +407,8 @@ def _elsewhere(includes: tuple[str, ...]) -> str:
     if not includes:
         return "; is it a printer.cfg?"
     return (
-        f"; it may stand in {', '.join(includes)}, which is not followed: give one file that holds "
-        "all (cat them together)"
+        f"; it may stand in {', '.join(includes)}, which was not read: put it beside the file (on "
+        "the command line), or give one file that holds all (cat them together)"
     )
 
 

@@ -277,7 +277,7 @@ def test_indentation_counts_as_in_configparser(tmp_path: Path, encoding: str):
 
 def test_a_machine_from_a_printer_cfg(store: MachineStore, config: Path, capsys):
     assert machines("from-config", config, "--name", "mine", "--title", "My Voron") == 0
-    assert "note: [include mainsail.cfg] in printer.cfg: not followed" in capsys.readouterr().out
+    assert "note: [include mainsail.cfg] in printer.cfg: not read" in capsys.readouterr().out
     machine = store.current("mine").machine
     assert (machine.title, machine.kinematics) == ("My Voron", "corexy")
     planner, extruder = machine.firmware.planner, machine.firmware.extruder
@@ -469,7 +469,7 @@ def test_resonances_that_are_none(store: MachineStore, config: Path, capsys, her
             "filament_diameter: 0",
             ["[extruder] filament_diameter: 0 must be above 0"],
         ),
-        ("max_accel = 4000", "", ["[printer] lacks max_accel", "mainsail.cfg", "not followed"]),
+        ("max_accel = 4000", "", ["[printer] lacks max_accel", "mainsail.cfg", "was not read"]),
         ("kinematics: corexy", "kinematics: delta", ["kinematics delta: only", "as sliced"]),
         ("[stepper_z]", "[stepper_q]", ["travel", "z"]),
         ("position_max: 250", "position_max: -9", ["travel", "-2.0", "-9.0"]),
@@ -498,7 +498,45 @@ def test_a_configuration_of_nothing_but_includes(tmp_path: Path, capsys):
     file.write_text("[include mainsail.cfg]\n[include x400.cfg]\n#*#\n#*# [extruder]\n#*# a = 1\n")
     assert machines("from-config", file, "--name", "mine") == 2
     message = one_line(capsys)
-    assert all(word in message for word in ("mainsail.cfg, x400.cfg", "not followed", "cat them"))
+    assert all(word in message for word in ("mainsail.cfg, x400.cfg", "was not read", "cat them"))
+
+
+def test_included_files_are_read_as_klipper_reads_them(store: MachineStore, tmp_path: Path, capsys):
+    """Vendors keep macros such as M205 in a file beside printer.cfg; a later option wins."""
+    folder = tmp_path / "printer [old]"  # no pattern, though it looks like one
+    (folder / "macros").mkdir(parents=True)
+    config = folder / "printer.cfg"
+    config.write_text(
+        "[include macros/*.cfg]\n" + CONFIG.replace("# not for us", "") + "[include later.cfg]\n"
+    )
+    (folder / "mainsail.cfg").write_text(
+        "[printer]\nmax_accel: 1\n[include ./macros/../arcs.cfg]\n"
+    )
+    (folder / "arcs.cfg").write_text("[gcode_arcs]\nresolution: 7\n[stepper_y]\nposition_min: -9\n")
+    (folder / "macros" / "a.cfg").write_text("[gcode_macro M205]\ngcode:\n  [printer]\n  M400\n")
+    (folder / "macros" / ".old.cfg").write_text("[gcode_macro M203]\ngcode:\n  M400\n")
+    (folder / "later.cfg").write_text("[printer]\nmax_velocity: 250\n#*# [extruder]\n#*# a = 1\n")
+    assert machines("from-config", config, "--name", "mine") == 0
+    assert "note: [include" not in capsys.readouterr().out
+    made = store.current("mine")
+    assert made.machine.firmware.macros == ("M205", "M900")
+    planner, travel = made.machine.firmware.planner, made.machine.travel
+    assert (planner.max_accel_mm_s2, planner.max_velocity_mm_s) == (4000.0, 250.0)
+    assert made.machine.firmware.arc_resolution_mm == 0.1
+    assert travel["y"].min_mm == -9.0
+    names = ["printer.cfg", "a.cfg", "mainsail.cfg", "arcs.cfg", "later.cfg"]
+    assert [source.name for source in made.sources] == names
+    (folder / "later.cfg").write_text("\n[printer]\nmax_velocity: fast\n")
+    assert machines("check", "mine", "--printer-cfg", config) == 2
+    assert "later.cfg line 3: [printer] max_velocity: 'fast' is no number" in one_line(capsys)
+
+
+def test_a_configuration_that_includes_itself(tmp_path: Path, capsys):
+    file = tmp_path / "printer.cfg"
+    file.write_text("[include a.cfg]\n")
+    (tmp_path / "a.cfg").write_text("[include printer.cfg]\n")
+    assert machines("from-config", file, "--name", "mine") == 2
+    assert "[include printer.cfg] in a.cfg includes itself" in one_line(capsys)
 
 
 @pytest.mark.parametrize(
