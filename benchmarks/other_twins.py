@@ -83,6 +83,27 @@ _LEVEL_DB = 0.6
 
 
 @dataclass(frozen=True, slots=True)
+class Print:
+    """A twin's print, and the contour rms with the recommended shapers."""
+
+    row: Row
+    recommended_um: float
+
+    @property
+    def to_recommended(self) -> float:
+        """Ours over the recommended shapers'."""
+        return self.row.ours_um / self.recommended_um
+
+    def __str__(self) -> str:
+        row = self.row
+        return (
+            f"{row.file[:25]:26}{row.twin:5}{row.none_um:7.2f}{self.recommended_um:8.2f}"
+            f"{row.shaper_um:7.2f}{row.ours_um:7.2f}{self.to_recommended:9.2f}"
+            f"{row.to_shaper:7.2f}{row.to_none:7.2f}"
+        )
+
+
+@dataclass(frozen=True, slots=True)
 class Shape:
     """What the modes of a twin may be: as wide as those of `golden/twins.json`."""
 
@@ -131,7 +152,7 @@ def main() -> int:
         f"{'/recom.':>9}{'/best':>7}{'/none':>7}",
         flush=True,
     )
-    found: list[tuple[Row, float]] = []
+    found: list[Print] = []
     with tempfile.TemporaryDirectory(prefix="stillpath-twins-") as folder:
         files = [plain_copy(find_input(name, shared), Path(folder)) for name in given.files]
         with ProcessPoolExecutor(given.jobs, mp_context=get_context("spawn")) as pool:
@@ -141,19 +162,13 @@ def main() -> int:
                 if any(part in name for part in given.pairs)
             }
             for name, done in waiting.items():
-                for row, recommended_um in done.result():
-                    found.append((row, recommended_um))
-                    ratio = row.ours_um / recommended_um
-                    print(
-                        f"{name:38}{row.file[:25]:26}{row.twin:5}{row.none_um:7.2f}"
-                        f"{recommended_um:8.2f}{row.shaper_um:7.2f}{row.ours_um:7.2f}"
-                        f"{ratio:9.2f}{row.to_shaper:7.2f}{row.to_none:7.2f}",
-                        flush=True,
-                    )
+                for one in done.result():
+                    found.append(one)
+                    print(f"{name:38}{one}", flush=True)
     for what, ratios in (
-        ("the recommended shaper", [row.ours_um / um for row, um in found]),
-        ("the best-tuned shaper", [row.to_shaper for row, _ in found]),
-        ("nothing", [row.to_none for row, _ in found]),
+        ("the recommended shaper", [one.to_recommended for one in found]),
+        ("the best-tuned shaper", [one.row.to_shaper for one in found]),
+        ("nothing", [one.row.to_none for one in found]),
     ):
         print(f"to {what}: geometric mean {geometric_mean(ratios):.3f}, worst {max(ratios):.3f}")
     return 0
@@ -189,7 +204,7 @@ def of_pair(name: str, files: Sequence[Path], shared: Path, cache: Path) -> list
             judge = Judge(truth, members=False)
             for section in Shaped.through(own, pulses):
                 judge.add(section)
-            found.append((row, 1e3 * judge.contour.rms))
+            found.append(Print(row, 1e3 * judge.contour.rms))
     return found
 
 
