@@ -112,12 +112,7 @@ def main() -> int:
         with ProcessPoolExecutor(given.jobs, mp_context=get_context("spawn")) as pool:
             waiting = [
                 pool.submit(
-                    judged,
-                    file,
-                    machine,
-                    {twin: twin_of(machine, name, twin, shared) for twin in ("a", "b")},
-                    options,
-                    given.cache,
+                    judged, file, machine, twins_of(machine, name, shared), options, given.cache
                 )
                 for file in files
                 for name, machine in machines.items()
@@ -145,14 +140,17 @@ def main() -> int:
     return 1 if missed else 0
 
 
-def twin_of(shipped: Machine, name: str, twin: str, shared: Path) -> Machine:
-    """Return the machine with the plants of a twin."""
-    plants = json.loads((shared / "golden" / "twins.json").read_text())[name][twin]
-    axes = {
-        axis: PlantSetSpec(nominal=RelativeModesSpec.model_validate({"modes": one["modes"]}))
-        for axis, one in plants.items()
-    }
-    return shipped.model_copy(update={"axes": axes, "name": f"{shipped.name}-{twin}"})
+def twins_of(shipped: Machine, name: str, shared: Path) -> dict[str, Machine]:
+    """Return the machine with the plants of its twins a and b."""
+    twins = json.loads((shared / "golden" / "twins.json").read_text())[name]
+    found = {}
+    for twin in ("a", "b"):
+        axes = {
+            axis: PlantSetSpec(nominal=RelativeModesSpec.model_validate({"modes": one["modes"]}))
+            for axis, one in twins[twin].items()
+        }
+        found[twin] = shipped.model_copy(update={"axes": axes, "name": f"{shipped.name}-{twin}"})
+    return found
 
 
 def from_tables(shipped: Machine, shared: Path) -> Machine:
