@@ -16,6 +16,7 @@ from stillpath.models.identification.readers.checks import RANGE_ENDED
 from stillpath.models.identification.spectrum_model import moved_most
 from stillpath.models.identification.trust import main_mode, main_mode_known
 from stillpath.models.identification.types import (
+    LEAST_COHERENCE,
     AxisIdentification,
     Excitation,
     Fit,
@@ -59,7 +60,7 @@ _POOR, _POOR_DB = 0.15, 1.1
 _USELESS, _USELESS_DB = 0.5, 6.0
 """Residuals beyond which a fit is no model of what was measured."""
 _AHEAD_S = 1e-3
-_LEAST_COHERENCE, _LEAST_POINTS, _SLOPE_TOLERANCE = 0.95, 4, 0.2
+_LEAST_POINTS, _SLOPE_TOLERANCE = 4, 0.2
 _WARNING = "warning: "
 
 
@@ -312,7 +313,7 @@ def scale_warnings(responses: Sequence[FrequencyResponse], fit: Fit) -> list[str
 def _slope_text(response: FrequencyResponse) -> str:
     """Describe a response that follows a power of f over its lowest octave."""
     f_hz = response.f_hz
-    known = (f_hz > 0) & (np.abs(response.response) > 0) & ~(response.coherence < _LEAST_COHERENCE)
+    known = (f_hz > 0) & (np.abs(response.response) > 0) & ~(response.coherence < LEAST_COHERENCE)
     if np.count_nonzero(known) < _LEAST_POINTS:
         return ""
     lowest = known & (f_hz <= 2.0 * f_hz[known].min())
