@@ -219,8 +219,8 @@ def chosen_options(**given: Any) -> Options:
     """Return the options of a job; those given as None have their defaults."""
     from pydantic import ValidationError
 
+    from stillpath.cli.wrong_options import wrong_option
     from stillpath.pipeline.options import Options
-    from stillpath.service.wrong_options import wrong_option
 
     try:
         return Options(**{name: value for name, value in given.items() if value is not None})

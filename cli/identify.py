@@ -132,8 +132,8 @@ class ReaderOptions:
         """Return the settings of the readers, checked."""
         from pydantic import ValidationError
 
+        from stillpath.cli.wrong_options import wrong_option
         from stillpath.models.identification.readers import ReadSettings
-        from stillpath.service.wrong_options import wrong_option
 
         given = asdict(self)
         given |= {"axis": axis, **_columns(given.pop("columns"))}

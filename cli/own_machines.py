@@ -119,7 +119,7 @@ def _settings() -> MachineSettings:
 def _checked(make: Callable[..., _Made], **given: Any) -> _Made:
     from pydantic import ValidationError
 
-    from stillpath.service.wrong_options import wrong_setting
+    from stillpath.cli.wrong_options import wrong_setting
 
     try:
         return make(**given)

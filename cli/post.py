@@ -44,13 +44,13 @@ def compensate_in_place(
     from pydantic import ValidationError
 
     from stillpath.cli.own_machines import open_machines
+    from stillpath.cli.wrong_options import wrong_option
     from stillpath.compensation.base import DesignError
     from stillpath.gcode.errors import GcodeError
     from stillpath.models.errors import ModelError
     from stillpath.pipeline.options import Options
     from stillpath.pipeline.progress import Progress
     from stillpath.reports import render_report
-    from stillpath.service.wrong_options import wrong_option
 
     def report(progress: Progress) -> None:
         tell(progress.stage, progress.fraction)

@@ -11,7 +11,7 @@ from stillpath.applications.proof.figures import ReadbackReport
 from stillpath.applications.proof.halves import ProofPrint
 from stillpath.applications.proof.ring_figures import Half, RingReport
 from stillpath.applications.proof.tower import Tower
-from stillpath.models.confirmation import um_text
+from stillpath.models.confirmation import rounded_um
 
 __all__ = ["print_proof", "print_readback", "print_ring", "print_tower"]
 
@@ -122,7 +122,7 @@ def print_ring(report: RingReport) -> None:
             low, high = axis.band_hz
             console.print(
                 f"{axis.axis.upper()}: {', '.join(axis.logs)}, {low:.0f} to {high:.0f} Hz, noise "
-                f"{um_text(axis.floor_um or 0.0)} µm taken off, "
+                f"{rounded_um(axis.floor_um or 0.0)} µm taken off, "
                 f"gain of the sensor {axis.gain:.2f}, "
                 f"{100 * (axis.misses or 0.0):.0f} % of the motion in no plant of the set"
             )
@@ -133,8 +133,8 @@ def print_ring(report: RingReport) -> None:
 def _half(half: Half) -> tuple[str, ...]:
     return (
         str(half.stops),
-        f"{um_text(half.measured_um)} ± {um_text(half.scatter_um, 1)}",
-        " - ".join(um_text(value) for value in half.predicted_um),
+        f"{rounded_um(half.measured_um)} ± {rounded_um(half.scatter_um, 1)}",
+        " - ".join(rounded_um(value) for value in half.predicted_um),
         f"{half.measured_mm_s2:.0f}",
         "{:.0f} - {:.0f}".format(*half.predicted_mm_s2),
     )

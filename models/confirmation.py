@@ -16,7 +16,7 @@ from stillpath.models.provenance import SourceFile
 if TYPE_CHECKING:
     from stillpath.models.machine import Machine
 
-__all__ = ["Confirmation", "confirmation_text", "plants_digest", "um_text"]
+__all__ = ["Confirmation", "confirmation_text", "plants_digest", "rounded_um"]
 
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{12}$")]
 
@@ -85,12 +85,12 @@ def _axis_text(machine: Machine, axis: Literal["x", "y"]) -> str:
         )
     low, high = found.predicted_um
     return (
-        f"{found.verdict} on {found.tested_on}: predicted {um_text(low)} to {um_text(high)} µm, "
-        f"measured {um_text(found.measured_um)} µm"
+        f"{found.verdict} on {found.tested_on}: predicted {rounded_um(low)} to "
+        f"{rounded_um(high)} µm, measured {rounded_um(found.measured_um)} µm"
     )
 
 
-def um_text(value: float, digits: int = 2) -> str:
+def rounded_um(value: float, digits: int = 2) -> str:
     """Return micrometres rounded to significant digits, never with an exponent of ten."""
     text = f"{value:.{digits}g}"
     return f"{value:.0f}" if "e+" in text else text

@@ -366,12 +366,18 @@ class PlantSetSpec(Document):
         return self.provenance is not None and self.provenance.friction == "assumed"
 
     def without_delay(self) -> PlantSetSpec:
-        """Return the set without what delays slow motion, where its plants say what that is."""
+        """Return the set for which commands are designed: none of its modes' damping is `grounded`.
+
+        Spectra do not show how much of it is, and leading by what the clocks of logs show made some
+        printers better and others worse (docs/tried.md). Other plants keep what delay they have.
+        """
         if isinstance(self.members, ParametricMembers):
             members: tuple[WeightedMember, ...] | ParametricMembers = self.members
         else:
-            members = tuple(m.model_copy(update={"plant": _prompt(m.plant)}) for m in self.members)
-        return self.model_copy(update={"nominal": _prompt(self.nominal), "members": members})
+            members = tuple(
+                m.model_copy(update={"plant": _without_delay(m.plant)}) for m in self.members
+            )
+        return self.model_copy(update={"nominal": _without_delay(self.nominal), "members": members})
 
     def weighted_members(self) -> tuple[WeightedMember, ...]:
         """Return the members written out, the nominal plant alone if there are none."""
@@ -384,7 +390,7 @@ class PlantSetSpec(Document):
         return self.members or (WeightedMember(plant=self.nominal),)
 
 
-def _prompt(plant: PlantSpec) -> PlantSpec:
+def _without_delay(plant: PlantSpec) -> PlantSpec:
     return plant.without_delay() if isinstance(plant, RelativeModesSpec) else plant
 
 

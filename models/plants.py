@@ -13,8 +13,9 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.polynomial.polynomial import polyval
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from stillpath.models.arrays import Array, Complex
 from stillpath.models.errors import ModelError
 from stillpath.models.plant_specs import (
     MOST_FRICTION_MM,
@@ -61,7 +62,6 @@ __all__ = [
     "plant_set",
 ]
 
-Matrix = NDArray[np.float64]
 _MOST_ELEMENTS = 1_000_000
 """Of the matrices that a frequency response inverts at a time."""
 
@@ -77,9 +77,9 @@ class _StateSpace:
         What was changed on reading the model.
     """
 
-    a: Matrix
-    b: Matrix
-    c: Matrix
+    a: Array
+    b: Array
+    c: Array
     d: float
     notes: tuple[str, ...] = ()
 
@@ -88,15 +88,15 @@ class _StateSpace:
         """Number of states."""
         return len(self.b)
 
-    def poles(self) -> NDArray[np.complex128]:
+    def poles(self) -> Complex:
         """Return the eigenvalues of `a`."""
         return np.linalg.eigvals(self.a).astype(complex)
 
-    def zeros(self) -> NDArray[np.complex128]:
+    def zeros(self) -> Complex:
         """Return the finite transmission zeros."""
         return transmission_zeros(self.a, self.b, self.c, self.d)
 
-    def _at(self, points: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    def _at(self, points: Complex) -> Complex:
         if self.order == 0:
             return np.full(len(points), self.d, complex)
         response = np.empty(len(points), complex)
@@ -116,11 +116,11 @@ class _StateSpace:
 class ContinuousPlant(_StateSpace):
     """x' = a x + b u, y = c x + d u, in seconds."""
 
-    def frequency_response(self, f_hz: ArrayLike) -> NDArray[np.complex128]:
+    def frequency_response(self, f_hz: ArrayLike) -> Complex:
         """Return G(2 pi j f) at the frequencies `f_hz`."""
         return self._at(2j * np.pi * np.atleast_1d(np.asarray(f_hz, float)))
 
-    def modes(self) -> Matrix:
+    def modes(self) -> Array:
         """Return rows (f_hz, zeta) of the resonances, rising in frequency."""
         return frequency_and_damping(self.poles(), None)
 
@@ -155,12 +155,12 @@ class DiscretePlant(_StateSpace):
 
     dt_s: float = 0.0
 
-    def frequency_response(self, f_hz: ArrayLike) -> NDArray[np.complex128]:
+    def frequency_response(self, f_hz: ArrayLike) -> Complex:
         """Return G(exp(2 pi j f dt)) at the frequencies `f_hz`, from samples to samples."""
         f = np.atleast_1d(np.asarray(f_hz, float))
         return self._at(np.exp(2j * np.pi * f * self.dt_s))
 
-    def modes(self) -> Matrix:
+    def modes(self) -> Array:
         """Return rows (f_hz, zeta) of the resonances, rising in frequency."""
         return frequency_and_damping(self.poles(), self.dt_s)
 
@@ -175,7 +175,7 @@ class DiscretePlant(_StateSpace):
         slowest = np.log(tolerance) / np.log(radius) if radius > 0 else 0.0
         return float(max(slowest, self.order) * self.dt_s)
 
-    def impulse_response(self, samples: int) -> Matrix:
+    def impulse_response(self, samples: int) -> Array:
         """Return the first `samples` Markov parameters d, cb, cab, ..."""
         out = np.empty(samples)
         x = self.b.copy()
@@ -185,7 +185,7 @@ class DiscretePlant(_StateSpace):
                 x = self.a @ x
         return out
 
-    def rest_state(self, u: float = 1.0) -> Matrix:
+    def rest_state(self, u: float = 1.0) -> Array:
         """Return the state in which the plant stands still at the constant command `u`."""
         return np.asarray(np.linalg.solve(np.eye(self.order) - self.a, self.b) * u, np.float64)
 
@@ -202,7 +202,7 @@ class PlantSet:
 
     nominal: DiscretePlant
     members: tuple[DiscretePlant, ...]
-    weights: Matrix
+    weights: Array
 
     @property
     def dt_s(self) -> float:
@@ -266,7 +266,7 @@ def plant_set(spec: PlantSetSpec, dt_s: float) -> PlantSet:
 
 def frequency_response(
     plant: PlantSpec | ContinuousPlant | DiscretePlant, f_hz: ArrayLike
-) -> NDArray[np.complex128]:
+) -> Complex:
     """Return the response at `f_hz`; a document answers from its roots, without realisation."""
     if isinstance(plant, (ContinuousPlant, DiscretePlant)):
         return plant.frequency_response(f_hz)
@@ -287,7 +287,7 @@ def frequency_response(
 
 
 def balanced_discrete(
-    a: Matrix, b: Matrix, c: Matrix, d: float, notes: Sequence[str], dt_s: float
+    a: Array, b: Array, c: Array, d: float, notes: Sequence[str], dt_s: float
 ) -> DiscretePlant:
     """Return a DiscretePlant with its states scaled to equal size at input and output."""
     return DiscretePlant(*balanced(a, b, c, d, discrete=True), tuple(notes), dt_s)

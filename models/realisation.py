@@ -7,16 +7,15 @@ decades of frequency); sections of order two with their poles in the matrix do n
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stillpath.models.arrays import Array, Complex
 from stillpath.models.errors import ModelError
 from stillpath.models.roots import Roots
 
 __all__ = ["balanced", "cascade", "transmission_zeros"]
 
-Matrix = NDArray[np.float64]
-System = tuple[Matrix, Matrix, Matrix, float]
-_Group = NDArray[np.complex128]
+System = tuple[Array, Array, Array, float]
+_Group = Complex
 
 _LEAST_DECAY = 1e-14
 """Of a pole, relative: with less the Gramians are rounding."""
@@ -43,7 +42,7 @@ def cascade(roots: Roots) -> System:
     return a, b, c, d
 
 
-def balanced(a: Matrix, b: Matrix, c: Matrix, d: float, *, discrete: bool) -> System:
+def balanced(a: Array, b: Array, c: Array, d: float, *, discrete: bool) -> System:
     """Scale every state so that the command reaches it as well as it reaches the output.
 
     Diagonal balancing: equal diagonals of both Gramians. Unlike a full balancing it needs no
@@ -74,7 +73,7 @@ def balanced(a: Matrix, b: Matrix, c: Matrix, d: float, *, discrete: bool) -> Sy
     return a * scale[:, None] / scale, b * scale, c / scale, d
 
 
-def transmission_zeros(a: Matrix, b: Matrix, c: Matrix, d: float) -> NDArray[np.complex128]:
+def transmission_zeros(a: Array, b: Array, c: Array, d: float) -> Complex:
     """Return the finite generalised eigenvalues of the Rosenbrock pencil."""
     from scipy.linalg import eigvals
 
@@ -87,17 +86,17 @@ def transmission_zeros(a: Matrix, b: Matrix, c: Matrix, d: float) -> NDArray[np.
     alpha, beta = eigvals(pencil, mass, homogeneous_eigvals=True)
     # Infinite zeros come out as beta of rounding size.
     finite = np.abs(beta) > 1e-10 * np.hypot(np.abs(alpha), np.abs(beta))
-    zeros: NDArray[np.complex128] = alpha[finite] / beta[finite]
+    zeros: Complex = alpha[finite] / beta[finite]
     return zeros
 
 
-def _solve_continuous(a: Matrix, q: Matrix) -> Matrix:
+def _solve_continuous(a: Array, q: Array) -> Array:
     from scipy.linalg import solve_continuous_lyapunov
 
     return np.asarray(solve_continuous_lyapunov(a, -q), dtype=np.float64)
 
 
-def _groups(roots: NDArray[np.complex128]) -> list[_Group]:
+def _groups(roots: Complex) -> list[_Group]:
     """Conjugate pairs, then real roots two by two, then a single real root."""
     upper = roots[roots.imag > 0]
     groups = [np.array([r, r.conjugate()]) for r in upper]

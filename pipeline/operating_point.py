@@ -10,7 +10,7 @@ from stillpath.gcode.types import Moves
 from stillpath.models.machine import Machine
 from stillpath.models.operating import OperatingGrid, machine_at, mass_schedules
 from stillpath.models.schedule import EMPTY, OperatingPoint, resonances_hz
-from stillpath.simulation.scheduled import BLEND_STEP, SIMULATION_STEP
+from stillpath.simulation.machine_response import BLEND_STEP, SIMULATION_STEP
 
 __all__ = ["Operation"]
 

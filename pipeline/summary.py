@@ -9,7 +9,7 @@ from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.firmware.writing import StreamWriter
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.slicers.facts import SlicerFacts
-from stillpath.models.confirmation import confirmation_text, um_text
+from stillpath.models.confirmation import confirmation_text, rounded_um
 from stillpath.models.machine import Machine
 from stillpath.pipeline.caution import Choice
 from stillpath.pipeline.caution_notes import prediction_note, stated_note
@@ -174,7 +174,7 @@ class Summary:
         compared = self.budget is None and not self.options.method.startswith("shaper:")
         if compared and ours >= max(least_ratio * shaper, NEGLIGIBLE_UM):
             yield (
-                f"{SHAPER_IS_BETTER}: {self.shaper.label} alone would leave {um_text(shaper)} µm "
-                f"rms of contour error, this file {um_text(ours)} µm. "
+                f"{SHAPER_IS_BETTER}: {self.shaper.label} alone would leave "
+                f"{rounded_um(shaper)} µm rms of contour error, this file {rounded_um(ours)} µm. "
                 "Print it as sliced with that shaper, or let method advise write the commands"
             )

@@ -16,8 +16,8 @@ from stillpath.models.schedule import OperatingPoint
 from stillpath.pipeline.following import follow_tolerance_mm, strayed
 from stillpath.pipeline.measuring.points import MotionSamples
 from stillpath.pipeline.piece_compensator import DT_S, CompensatedPiece, Unfit
+from stillpath.simulation.machine_response import MachineStream
 from stillpath.simulation.measures import MotionMeter
-from stillpath.simulation.scheduled import MachineStream
 
 __all__ = ["NEGLIGIBLE_UM", "Verifier"]
 

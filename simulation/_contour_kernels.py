@@ -11,7 +11,12 @@ from stillpath.models.arrays import Array
 from stillpath.models.jit import kernel
 
 __all__ = [
+    "ALL",
     "BOX",
+    "COUNTED",
+    "EXTRUDING",
+    "RESTING",
+    "RESTS",
     "contour_distances",
     "contour_errors",
     "group_sums",
@@ -23,6 +28,12 @@ BOX = 16
 """Segments of the path that share a box."""
 _STRAIGHT_MM = 1e-11
 """A vertex this close to the line of a run continues it; rounding is smaller."""
+ALL, EXTRUDING, PENDING, RESTING = 0, 2, 4, 6
+"""Columns of sums of squares: of all samples, of those that extrude, of a rest that may yet count,
+of rests that count. The column behind each has the maximum."""
+LAST_X, LAST_Y, STILL, WAITING, COUNTED, RESTS = range(6)
+"""Places in the state of a rest: the path's last point, samples since it moved (-1: it never did),
+samples that may yet count, samples that count, rests that count."""
 
 
 @kernel(allocates=False)
@@ -206,15 +217,13 @@ def motion_sums(
     shortest, window : int
         The first `window` samples of a rest count if it has at least `shortest`.
     rest : ndarray, shape (6,)
-        Updated in place: last x, y of the path, still samples (-1 before the first motion), pending
-        samples of the rest, samples that count, rests that count.
+        Updated in place: `LAST_X` to `RESTS`.
     sums : ndarray, shape (channels, 8)
-        Updated in place; sum and maximum of squares: of all, of extruding, of the pending rest, and
-        of rests that count.
+        Updated in place: sum and maximum of squares at `ALL`, `EXTRUDING`, `PENDING`, `RESTING`.
     """
     n = len(x)
-    if n > 0 and math.isnan(rest[0]):
-        rest[0], rest[1] = x[0], y[0]
+    if n > 0 and math.isnan(rest[LAST_X]):
+        rest[LAST_X], rest[LAST_Y] = x[0], y[0]
     k = 0
     while k < n:
         next_k = k
@@ -229,12 +238,12 @@ def motion_sums(
         _add_sample(x, y, points, extruding, k, moved, shortest, window, rest, sums)
         k += 1
     if n > 0:
-        rest[0], rest[1] = x[n - 1], y[n - 1]
+        rest[LAST_X], rest[LAST_Y] = x[n - 1], y[n - 1]
 
 
 @kernel(inline=True, allocates=False)
 def _moved(x: Array, y: Array, k: int, rest: Array, still_mm: float) -> bool:
-    last_x, last_y = (x[k - 1], y[k - 1]) if k > 0 else (rest[0], rest[1])
+    last_x, last_y = (x[k - 1], y[k - 1]) if k > 0 else (rest[LAST_X], rest[LAST_Y])
     moved: bool = abs(x[k] - last_x) > still_mm or abs(y[k] - last_y) > still_mm
     return moved
 
@@ -245,7 +254,8 @@ def _add_squares(
 ) -> None:
     """Add samples that belong to no rest."""
     for c in range(len(points)):
-        total, most, printed, printed_most = sums[c, 0], sums[c, 1], sums[c, 2], sums[c, 3]
+        total, most = sums[c, ALL], sums[c, ALL + 1]
+        printed, printed_most = sums[c, EXTRUDING], sums[c, EXTRUDING + 1]
         for k in range(len(extruding)):
             ex, ey = points[c, 0, k] - x[k], points[c, 1, k] - y[k]
             squared = ex * ex + ey * ey
@@ -257,7 +267,8 @@ def _add_squares(
                 printed += squared
                 if squared > printed_most:
                     printed_most = squared
-        sums[c, 0], sums[c, 1], sums[c, 2], sums[c, 3] = total, most, printed, printed_most
+        sums[c, ALL], sums[c, ALL + 1] = total, most
+        sums[c, EXTRUDING], sums[c, EXTRUDING + 1] = printed, printed_most
 
 
 @kernel(force_inline=True, allocates=False)
@@ -276,31 +287,31 @@ def _add_sample(
     """Add a sample that may belong to a rest."""
     if moved:
         # The sample at which the path arrives is the first of the rest.
-        rest[2] = rest[3] = 0.0
-    elif rest[2] >= 0.0:
-        rest[2] += 1.0
-    rests = 0.0 <= rest[2] < window
-    settled = rests and rest[2] >= shortest
+        rest[STILL] = rest[WAITING] = 0.0
+    elif rest[STILL] >= 0.0:
+        rest[STILL] += 1.0
+    rests = 0.0 <= rest[STILL] < window
+    settled = rests and rest[STILL] >= shortest
     if rests:
-        rest[3] += 1.0
+        rest[WAITING] += 1.0
     if settled:
-        rest[4] += rest[3]
-        rest[3] = 0.0
-        rest[5] += 1.0 if rest[2] == shortest else 0.0
+        rest[COUNTED] += rest[WAITING]
+        rest[WAITING] = 0.0
+        rest[RESTS] += 1.0 if rest[STILL] == shortest else 0.0
     for c in range(len(points)):
         ex, ey = points[c, 0, k] - x[k], points[c, 1, k] - y[k]
         squared = ex * ex + ey * ey
-        sums[c, 0] += squared
-        sums[c, 1] = max(sums[c, 1], squared)
+        sums[c, ALL] += squared
+        sums[c, ALL + 1] = max(sums[c, ALL + 1], squared)
         if extruding[k]:
-            sums[c, 2] += squared
-            sums[c, 3] = max(sums[c, 3], squared)
+            sums[c, EXTRUDING] += squared
+            sums[c, EXTRUDING + 1] = max(sums[c, EXTRUDING + 1], squared)
         if moved:
-            sums[c, 4] = sums[c, 5] = 0.0
+            sums[c, PENDING] = sums[c, PENDING + 1] = 0.0
         if rests:
-            sums[c, 4] += squared
-            sums[c, 5] = max(sums[c, 5], squared)
+            sums[c, PENDING] += squared
+            sums[c, PENDING + 1] = max(sums[c, PENDING + 1], squared)
         if settled:
-            sums[c, 6] += sums[c, 4]
-            sums[c, 7] = max(sums[c, 7], sums[c, 5])
-            sums[c, 4] = sums[c, 5] = 0.0
+            sums[c, RESTING] += sums[c, PENDING]
+            sums[c, RESTING + 1] = max(sums[c, RESTING + 1], sums[c, PENDING + 1])
+            sums[c, PENDING] = sums[c, PENDING + 1] = 0.0

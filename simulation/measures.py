@@ -14,7 +14,12 @@ from numpy.typing import NDArray
 
 from stillpath.models.arrays import Array, Mask
 from stillpath.simulation._contour_kernels import (
+    ALL,
     BOX,
+    COUNTED,
+    EXTRUDING,
+    RESTING,
+    RESTS,
     contour_distances,
     contour_errors,
     group_sums,
@@ -293,18 +298,19 @@ class MotionMeter:
         self._extruding = np.zeros(0, bool)
         self._still_window = max(1, round(_RESIDUAL_S / dt_s))
         self._shortest = min(round(_SHORTEST_REST_S / dt_s), self._still_window - 1)
+        # No point of the path yet, and no motion.
         self._rest = np.array([np.nan, np.nan, -1.0, 0.0, 0.0, 0.0])
         self._sums = np.zeros((channels, 8))
 
     @property
     def tracking_all(self) -> list[Tally]:
         """Tracking error [mm] of every channel, at every sample."""
-        return self._tallies(0, self._seen)
+        return self._tallies(ALL, self._seen)
 
     @property
     def tracking_extruding(self) -> list[Tally]:
         """The same while extruding."""
-        return self._tallies(2, self._seen_extruding)
+        return self._tallies(EXTRUDING, self._seen_extruding)
 
     @property
     def residual(self) -> list[Tally]:
@@ -313,12 +319,12 @@ class MotionMeter:
         A rest begins when the planned path stops changing after a motion, and counts if it lasts
         20 ms; rests shorter than 0.1 s count as long as they last.
         """
-        return self._tallies(6, int(self._rest[4]))
+        return self._tallies(RESTING, int(self._rest[COUNTED]))
 
     @property
     def rests(self) -> int:
         """Number of rests so far."""
-        return int(self._rest[5])
+        return int(self._rest[RESTS])
 
     def push(self, y_d_mm: Array, y_mm: Array, extruding: Mask) -> ContourErrors:
         """Add a block: planned (2, n) and executed positions (channels, 2, n), the rest (n,).

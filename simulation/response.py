@@ -1,4 +1,4 @@
-"""Simulate the linear response of a machine's axes to a command, block by block."""
+"""Simulate the linear response of plants to a command, block by block."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ from stillpath.applications.proof.ring_motion import (
 )
 from stillpath.applications.proof.ring_test import AXES, Axis
 from stillpath.models.arrays import Array
-from stillpath.models.confirmation import Confirmation, plants_digest, um_text
+from stillpath.models.confirmation import Confirmation, plants_digest, rounded_um
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.types import AccelerationLog
 from stillpath.models.machine import Machine
@@ -302,11 +302,11 @@ class _Axis:
     ) -> tuple[Verdict, str]:
         low, high = compensated.predicted_um
         said = (
-            f"measured {um_text(compensated.measured_um)} ± "
-            f"{um_text(compensated.scatter_um, 1)} µm after "
-            f"{compensated.stops} compensated stops, predicted {um_text(low)} to "
-            f"{um_text(high)}; "
-            f"{um_text(planned.measured_um)} µm as planned"
+            f"measured {rounded_um(compensated.measured_um)} ± "
+            f"{rounded_um(compensated.scatter_um, 1)} µm after "
+            f"{compensated.stops} compensated stops, predicted {rounded_um(low)} to "
+            f"{rounded_um(high)}; "
+            f"{rounded_um(planned.measured_um)} µm as planned"
         )
         if compensated.predicted_um[0] > planned.predicted_um[0] / _LEAST_GAIN:
             return "says nothing", (
@@ -315,7 +315,7 @@ class _Axis:
             )
         if off.rms < _ABOVE_FLOOR * noise_um:
             return "says nothing", (
-                f"{said}: the noise of the log is {um_text(noise_um)} µm, too much for this "
+                f"{said}: the noise of the log is {rounded_um(noise_um)} µm, too much for this "
                 "ringing; take a better sensor, or fix it better"
             )
         least, most = on.reaches(-_SIGMAS), on.reaches(_SIGMAS)

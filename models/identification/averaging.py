@@ -9,11 +9,10 @@ import numpy as np
 
 from stillpath.models.arrays import Array, Complex
 from stillpath.models.errors import ModelError
-from stillpath.models.identification.types import FrequencyResponse, Spectrum
+from stillpath.models.identification.types import LEAST_COHERENCE, FrequencyResponse, Spectrum
 
 __all__ = ["aligned_to", "low_frequency_delay", "mean_response", "mean_spectrum", "on_grid"]
 
-_COHERENT = 0.95
 _DELAYS_S = 20e-3
 _FLAT = 0.2
 """Logarithm of the modulus that a mode must add before its phase counts."""
@@ -115,7 +114,7 @@ def aligned_to(response: FrequencyResponse, reference: FrequencyResponse) -> Fre
     The delay maximises the agreement over all coherent frequencies: low frequencies alone would be
     too noisy.
     """
-    used = ~(response.coherence < _COHERENT)
+    used = ~(response.coherence < LEAST_COHERENCE)
     low, high = reference.f_hz[0], reference.f_hz[-1]
     used &= (response.f_hz >= low) & (response.f_hz <= high)
     f = response.f_hz[used]

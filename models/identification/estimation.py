@@ -23,6 +23,7 @@ from stillpath.models.identification.local_model import (
 )
 from stillpath.models.identification.nozzle import frame_of
 from stillpath.models.identification.types import (
+    LEAST_COHERENCE,
     AccelerationLog,
     DrivenLog,
     Excitation,
@@ -49,7 +50,6 @@ _PLATEAU_HZ = (8.0, 15.0)
 _PLATEAU_TOLERANCE = 0.22
 """Sensors are up to 15 % off, and a frame on its feet adds some per cent."""
 _NOT_MOVING = 0.3
-_LEAST_COHERENCE = 0.95
 _LEAST_FOLLOWED = 0.15
 _DRIFT_S = 0.05
 """Modes delay the upper half of the band by some 10 ms more or less than the lower one."""
@@ -231,12 +231,12 @@ def estimate_driven(
 
 
 def _check_followed(response: FrequencyResponse, excitation: Excitation) -> None:
-    coherent = response.coherence >= _LEAST_COHERENCE
+    coherent = response.coherence >= LEAST_COHERENCE
     if np.mean(coherent) < _LEAST_FOLLOWED:
         raise ModelError(
             f"{response.source}: the log follows a sweep at {excitation.hz_per_s:g} Hz/s at only "
             f"{np.mean(coherent):.0%} of its frequencies (coherence of at least "
-            f"{_LEAST_COHERENCE}; at least {_LEAST_FOLLOWED:.0%} are needed): the sensor is too "
+            f"{LEAST_COHERENCE}; at least {_LEAST_FOLLOWED:.0%} are needed): the sensor is too "
             "noisy or loose, the axis rubs so much that it hardly moves, or the sweep was another "
             "one, see hz_per_sec in printer.cfg"
         )
@@ -307,10 +307,10 @@ def _nyquist_hz(records: Sequence[Transformed]) -> float:
 def _driven_response(
     logs: Sequence[DrivenLog], f_hz: Array, found: LocalResponse, label: str
 ) -> FrequencyResponse:
-    if not np.any(found.coherence >= _LEAST_COHERENCE):
+    if not np.any(found.coherence >= LEAST_COHERENCE):
         raise ModelError(
             f"{logs[0].source}: the measurement follows the command at no frequency (greatest "
-            f"coherence {found.coherence.max():.2f}, {_LEAST_COHERENCE} is needed); check that the "
+            f"coherence {found.coherence.max():.2f}, {LEAST_COHERENCE} is needed); check that the "
             "columns are command and measurement of the same axis, and drive it harder"
         )
     return FrequencyResponse(

@@ -24,7 +24,11 @@ from stillpath.models.arrays import Array, Complex
 from stillpath.models.friction import bend_of
 from stillpath.models.identification.alignment import AlignedLog
 from stillpath.models.identification.estimation import plateau_gain
-from stillpath.models.identification.local_model import Transformed, local_response
+from stillpath.models.identification.local_model import (
+    Transformed,
+    local_response,
+    log_residual,
+)
 from stillpath.models.identification.types import FrequencyResponse
 from stillpath.models.plants import MOST_FRICTION_MM
 
@@ -111,8 +115,7 @@ def better_explained(sliding: FrequencyResponse, stuck: FrequencyResponse) -> Fr
 
     Well above the resonance an axis moves so little that its guides stick, and act as springs.
     """
-    gain = np.log(np.maximum(1.0 - sliding.coherence, 1e-9))
-    gain -= np.log(np.maximum(1.0 - stuck.coherence, 1e-9))
+    gain = log_residual(sliding.coherence) - log_residual(stuck.coherence)
     resonance_hz = sliding.f_hz[np.argmax(np.abs(sliding.response))]
     above = sliding.f_hz > _ABOVE * resonance_hz
     from_here = np.where(above, np.cumsum(gain[::-1])[::-1], -np.inf)
@@ -154,7 +157,7 @@ def _left(aligned: AlignedLog, response: FrequencyResponse) -> Array:
     def left(late_s: float, size_mm: float) -> float:
         received = command * _earlier(bins_hz, late_s) - size_mm * rate
         found = local_response([Transformed(spacing_hz, received, measured)], f_hz, _HALF_BAND_HZ)
-        return float(np.mean(np.log(np.maximum(1.0 - found.coherence, 1e-9))))
+        return float(np.mean(log_residual(found.coherence)))
 
     return np.array([[left(late_s, size_mm) for size_mm in _SIZES_MM] for late_s in _LATE_S])
 

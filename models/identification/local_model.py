@@ -18,7 +18,7 @@ import numpy as np
 from stillpath.models.arrays import Array, Complex
 from stillpath.models.errors import ModelError
 
-__all__ = ["LocalResponse", "Transformed", "bins_needed", "local_response"]
+__all__ = ["LocalResponse", "Transformed", "bins_needed", "local_response", "log_residual"]
 
 _POWERS = 3
 _SHARED = 2 * _POWERS - 1
@@ -105,6 +105,11 @@ def bins_needed(records: int, *, transient: bool) -> int:
     """Return how many bins of each record a band should hold: twice the unknowns, and some."""
     unknowns = _SHARED + (_OWN * records if transient else 0)
     return -(-(2 * unknowns + 4) // records)
+
+
+def log_residual(coherence: Array) -> Array:
+    """Return the logarithm of the share of the power that a response leaves unexplained."""
+    return np.asarray(np.log(np.maximum(1.0 - coherence, 1e-9)), np.float64)
 
 
 def _regressors(band: _Band, unknowns: int, own: int | None) -> Complex:

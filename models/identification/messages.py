@@ -17,6 +17,7 @@ from stillpath.models.identification.readers.spectra import GAINS_TEXT
 from stillpath.models.identification.spectrum_model import moved_most
 from stillpath.models.identification.trust import main_mode, main_mode_known
 from stillpath.models.identification.types import (
+    LEAST_COHERENCE,
     AxisIdentification,
     Excitation,
     Fit,
@@ -74,7 +75,7 @@ _BETWEEN = (
     "right angle; if it is not, this is the test of a belt (AXIS=1,1 or 1,-1), which is of neither "
     "X nor Y"
 )
-_LEAST_COHERENCE, _LEAST_POINTS, _SLOPE_TOLERANCE = 0.95, 4, 0.2
+_LEAST_POINTS, _SLOPE_TOLERANCE = 4, 0.2
 _WARNING = "warning: "
 
 
@@ -331,7 +332,7 @@ def scale_warnings(responses: Sequence[FrequencyResponse], fit: Fit) -> list[str
 def _slope_text(response: FrequencyResponse) -> str:
     """Describe a response that follows a power of f over its lowest octave."""
     f_hz = response.f_hz
-    known = (f_hz > 0) & (np.abs(response.response) > 0) & ~(response.coherence < _LEAST_COHERENCE)
+    known = (f_hz > 0) & (np.abs(response.response) > 0) & ~(response.coherence < LEAST_COHERENCE)
     if np.count_nonzero(known) < _LEAST_POINTS:
         return ""
     lowest = known & (f_hz <= 2.0 * f_hz[known].min())

@@ -34,7 +34,13 @@ from stillpath.models.identification.response_candidate import (
 )
 from stillpath.models.identification.response_data import ResponseData, response_data
 from stillpath.models.identification.trust import main_mode_known
-from stillpath.models.identification.types import Fit, FrequencyResponse, ModeEstimate, OrderTrial
+from stillpath.models.identification.types import (
+    UNSEEN_ZETA,
+    Fit,
+    FrequencyResponse,
+    ModeEstimate,
+    OrderTrial,
+)
 from stillpath.models.plants import PairsSpec, RelativeModesSpec, frequency_response
 
 __all__ = ["alternatives", "fit_modes", "of_poles", "refit"]
@@ -50,7 +56,6 @@ _LEAST_PEAK, _LEAST_SHARE = 0.1, 0.005
 _ASSUMED = (1e-3, 0.01)
 """Relative change of frequency and damping due to the assumption of where damping acts."""
 _POLES_BAND, _ZETA, _SHARE = (1.1, 1.6), (3e-3, 1.0), (-2.0, 2.5)
-_UNSEEN_ZETA = 0.03
 _EARLIER_S, _DELAY_STEP_S = 10e-3, 0.25e-3
 _START_ZETA, _BEYOND = 0.08, 1.3
 _START_POINTS = 160
@@ -248,7 +253,7 @@ def _least_damping(data: ResponseData, fit: Modal) -> Array:
 def _calm_damping(data: ResponseData, fit: Modal) -> Array:
     """Return a least damping for modes above the band, of which only the flank was measured."""
     beyond = fit.structure.split(fit.theta)[0] * data.unit_hz > data.f_hz[-1]
-    return np.where(beyond, _UNSEEN_ZETA, _ZETA[0])
+    return np.where(beyond, UNSEEN_ZETA, _ZETA[0])
 
 
 def _calm(data: ResponseData, fit: Modal) -> Modal:

@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from stillpath.models.arrays import Array, Complex
+from stillpath.models.identification.types import UNSEEN_ZETA
 from stillpath.models.plants import PairsSpec, PolePair, ZeroPair
 
 __all__ = ["PairStructure"]
 
 # A zero exactly on the imaginary axis would make log G infinite at its frequency.
 _SMALL = 1e-9
-_UNSEEN_ZETA = 0.03
 _NO_TAU = 1e-5
 
 
@@ -138,14 +138,10 @@ class PairStructure:
         return np.concatenate([*low, np.full(m, -zz)]), np.concatenate([*high, np.full(m, zz)])
 
     def least_damping(self, theta: Array, least: float, top_hz: float) -> Array:
-        """Return the least damping of every pole pair: `least`, but 0.03 above `top_hz`.
-
-        Of a pair that was not swept over only the flank shows, hardly its damping: it must not
-        ring by chance.
-        """
+        """Return the least damping of every pole pair: `least`, above `top_hz` `UNSEEN_ZETA`."""
         _, log_f, _, _, _ = self.split(theta)
         beyond = np.exp(log_f) * self.unit_hz > top_hz
-        return np.where(beyond, max(_UNSEEN_ZETA, least), least)
+        return np.where(beyond, max(UNSEEN_ZETA, least), least)
 
 
 def _factors(x: Complex, log_f: Array, zeta: ArrayLike) -> Complex:

@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 from stillpath.models.arrays import Array, Complex
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.averaging import low_frequency_delay
-from stillpath.models.identification.types import FrequencyResponse
+from stillpath.models.identification.types import LEAST_COHERENCE, FrequencyResponse
 from stillpath.models.runs import runs
 
-__all__ = ["LEAST_COHERENCE", "ResponseData", "coherent", "coherent_part", "response_data"]
+__all__ = ["ResponseData", "coherent", "coherent_part", "response_data"]
 
-LEAST_COHERENCE = 0.95
 _RELATIVE_FLOOR = 0.02
 """Nonlinearity of a real axis: no point counts as better known than this share of the response
 or, where it has fallen below that, of its value at low frequency."""

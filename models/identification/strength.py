@@ -7,7 +7,11 @@ from scipy.fft import next_fast_len, rfft
 from scipy.signal.windows import tukey
 
 from stillpath.models.arrays import Array
-from stillpath.models.identification.local_model import Transformed, local_response
+from stillpath.models.identification.local_model import (
+    Transformed,
+    local_response,
+    log_residual,
+)
 
 __all__ = ["strength"]
 
@@ -42,7 +46,7 @@ def strength(
     def left(ratio: float) -> float:
         record = Transformed(spacing_hz, np.asarray(swept + ratio * pulsed, np.complex128), seen)
         coherence = local_response([record], f_hz, _HALF_BAND_HZ).coherence
-        return float(np.mean(np.log(np.maximum(1.0 - coherence, 1e-9))))
+        return float(np.mean(log_residual(coherence)))
 
     rough = min(_TRIED.tolist(), key=left)
     tried = rough * _NEAR

@@ -9,9 +9,11 @@ import numpy as np
 
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.alignment import check_pair
-from stillpath.models.identification.response_data import LEAST_COHERENCE, coherent
+from stillpath.models.identification.response_data import coherent
 from stillpath.models.identification.spectrum_model import moved_most
 from stillpath.models.identification.types import (
+    LEAST_COHERENCE,
+    UNSEEN_ZETA,
     Axis,
     AxisIdentification,
     Fit,
@@ -39,8 +41,6 @@ _HIGHEST_TEST_HZ, _WIDER = 300.0, 1.4
 """Klipper's largest max_freq, and how far a test should go beyond a resonance."""
 _MAIN_HZ = (1.0, 500.0)
 """As for a resonance that is typed in."""
-_UNSEEN_ZETA = 0.03
-"""Least damping of a mode beyond the band, of which only the flank was measured."""
 _MOST_UNSURE = 0.05
 """Relative standard deviation of the frequency of the mode that rings most."""
 _MOST_LEVEL = 2.0
@@ -125,8 +125,8 @@ def main_mode(fit: Fit) -> ModeEstimate | None:
     seen = [m for m in fit.modes if low <= m.f_hz <= high] if fit.magnitude_only else []
 
     def rings(mode: ModeEstimate) -> float:
-        known = mode.f_hz <= high or mode.zeta >= _UNSEEN_ZETA
-        return mode.peak if known else mode.peak * mode.zeta / _UNSEEN_ZETA
+        known = mode.f_hz <= high or mode.zeta >= UNSEEN_ZETA
+        return mode.peak if known else mode.peak * mode.zeta / UNSEEN_ZETA
 
     return max(seen or fit.modes, key=rings, default=None)
 

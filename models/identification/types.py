@@ -13,6 +13,8 @@ from stillpath.models.plants import PlantSetSpec, PlantSpec
 from stillpath.models.schedule import AxisSchedule
 
 __all__ = [
+    "LEAST_COHERENCE",
+    "UNSEEN_ZETA",
     "AccelerationLog",
     "Axis",
     "AxisIdentification",
@@ -28,6 +30,12 @@ __all__ = [
 ]
 
 Axis: TypeAlias = Literal["x", "y"]
+
+LEAST_COHERENCE = 0.95
+"""From here on a frequency counts as coherent: what was measured there follows the command."""
+UNSEEN_ZETA = 0.03
+"""Least damping of a mode beyond the band, of which only the flank was measured: it hardly shows
+the damping, and the mode must not ring by chance."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,8 +27,8 @@ from stillpath.pipeline.advising.advice import Advice, Bound, wanted_accel
 from stillpath.pipeline.measuring.reference_shaper import shaped_at, spread
 from stillpath.pipeline.pacing.samples import FileSamples, Sample
 from stillpath.pipeline.shaping import shaped
+from stillpath.simulation.machine_response import MachineStream
 from stillpath.simulation.measures import PathDistances
-from stillpath.simulation.scheduled import MachineStream
 
 __all__ = ["Trial"]
 

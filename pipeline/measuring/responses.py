@@ -17,7 +17,7 @@ from stillpath.models.machine import Machine
 from stillpath.models.schedule import EMPTY, OperatingPoint
 from stillpath.pipeline.measuring.points import MotionSamples
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
-from stillpath.simulation.scheduled import MachineStream
+from stillpath.simulation.machine_response import MachineStream
 
 __all__ = ["ResponseSamples", "Responses"]
 

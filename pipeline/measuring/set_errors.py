@@ -15,8 +15,8 @@ from stillpath.models.arrays import Array, Mask
 from stillpath.models.machine import Machine
 from stillpath.models.plants import plant_set
 from stillpath.models.schedule import EMPTY, OperatingPoint
+from stillpath.simulation.machine_response import MachineStream
 from stillpath.simulation.measures import ContourErrors, ContourMeter, GroupTally
-from stillpath.simulation.scheduled import MachineStream
 
 __all__ = ["LANDING_S", "WHOLE", "ClassError", "ErrorSum", "SetErrors", "machine_numbers", "whole"]
 

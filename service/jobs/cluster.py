@@ -23,10 +23,10 @@ from typing import TYPE_CHECKING, Any
 
 import structlog
 
-from stillpath.service.jobs.preload import quiet_dask
 from stillpath.service.jobs.state import Job
 from stillpath.service.jobs.task import Runner
 from stillpath.service.jobs.worker import run_job
+from stillpath.service.jobs.worker_setup import quiet_dask
 from stillpath.service.processes import METHOD, OF_THE_SERVICE, loaded_context
 from stillpath.service.settings import Settings
 
@@ -51,7 +51,7 @@ DASK_SETTINGS: dict[str, Any] = {
     "distributed.worker.memory.pause": False,
     "distributed.worker.memory.terminate": False,
     "distributed.worker.profile.enabled": False,
-    "distributed.worker.preload": ["stillpath.service.jobs.preload"],
+    "distributed.worker.preload": ["stillpath.service.jobs.worker_setup"],
     "distributed.worker.multiprocessing-method": METHOD,
     # They end together with this process.
     "distributed.worker.daemon": True,

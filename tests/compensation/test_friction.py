@@ -14,8 +14,8 @@ from stillpath.models.friction import DryFriction
 from stillpath.models.machine import CommandLimits, Machine
 from stillpath.models.reference_motion import reference_motion
 from stillpath.models.store import load_machine
+from stillpath.simulation.machine_response import MachineStream
 from stillpath.simulation.measures import contour_error
-from stillpath.simulation.scheduled import MachineStream
 
 DT_S = 1e-3
 RESTS = np.array([[900, 1000], [2400, 2450]], np.int64)

@@ -23,9 +23,9 @@ from stillpath.models.schedule import (
     OperatingPoint,
 )
 from stillpath.models.store import load_machine
+from stillpath.simulation.machine_response import MachineStream
 from stillpath.simulation.measures import contour_error
 from stillpath.simulation.response import response
-from stillpath.simulation.scheduled import MachineStream
 
 Array = NDArray[np.float64]
 Piece = tuple[Array, NDArray[np.bool_], NDArray[np.int64]]

@@ -35,7 +35,7 @@ from stillpath.pipeline.pacing.samples import take_samples
 from stillpath.pipeline.reading import dialect_for
 from stillpath.pipeline.result import Result
 from stillpath.pipeline.simulate import simulate_file
-from stillpath.simulation.scheduled import MachineStream
+from stillpath.simulation.machine_response import MachineStream
 from tests.compensating import compensated
 from tests.gcode.container_files import binary
 from tests.gcode.prints import polygon

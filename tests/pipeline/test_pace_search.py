@@ -16,7 +16,7 @@ from stillpath.pipeline.measuring.set_errors import ClassError, ErrorSum, machin
 from stillpath.pipeline.pacing.budget import SpeedBudget
 from stillpath.pipeline.pacing.pace_search import PaceChoice, allowed_um, search
 from stillpath.pipeline.pacing.pace_trials import Factors, Tried
-from stillpath.simulation.scheduled import MachineStream
+from stillpath.simulation.machine_response import MachineStream
 
 WALL, INFILL = 0, 1
 

@@ -13,7 +13,7 @@ from stillpath.models.store import load_machine
 from stillpath.pipeline.measuring.points import MotionSamples
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.pipeline.measuring.responses import Responses, ResponseSamples
-from stillpath.simulation.scheduled import MachineStream
+from stillpath.simulation.machine_response import MachineStream
 from tests.gcode.cutting import blocks_of
 
 DT_S = 1e-3

@@ -5,23 +5,21 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from stillpath.models.arrays import Complex
+from stillpath.models.arrays import Array, Complex
 from stillpath.models.errors import ModelError
 from stillpath.models.realisation import transmission_zeros
 from stillpath.models.roots import dc_gain
 
 __all__ = ["zeros_poles_gain"]
 
-Matrix = NDArray[np.float64]
 
 _LARGEST_ORDER = 40
 _LARGEST_ERROR = 1e-3
 
 
 def zeros_poles_gain(
-    a: Matrix, b: Matrix, c: Matrix, d: float, dt_s: float | None
+    a: Array, b: Array, c: Array, d: float, dt_s: float | None
 ) -> tuple[Complex, Complex, float | None]:
     """Return the zeros, poles and leading gain of a state space of one input and output.
 
@@ -70,7 +68,7 @@ def zeros_poles_gain(
     return zeros, poles, gain
 
 
-def _relative_degree(a: Matrix, b: Matrix, c: Matrix, d: float) -> int:
+def _relative_degree(a: Array, b: Array, c: Array, d: float) -> int:
     """Return the position of the first Markov parameter that is not rounding."""
     size = float(np.linalg.norm(c) * np.linalg.norm(b))
     if abs(d) > 1e-10 * size:

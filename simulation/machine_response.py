@@ -1,4 +1,7 @@
-"""Response of a machine to a command while its plants change."""
+"""Response of a whole machine to a command: ripple, dry friction, plants that may change.
+
+`simulation.response` has the linear part of it, for plants as they are.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Setup of every Dask worker process: fewer resources, and no reaction to foreign signals."""
+"""Setup of every Dask worker process (a *preload* there): lower priority, no foreign signals."""
 
 from __future__ import annotations
 

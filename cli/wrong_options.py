@@ -13,6 +13,10 @@ if TYPE_CHECKING:
 
 __all__ = ["wrong_option", "wrong_setting"]
 
+_ALSO_OPTIONS = ("data_dir", "scheduler", "workers")
+"""Settings that `serve` and `worker` take as options too."""
+_SECRETS = ("database_url", "first_key", "webhook_secret")
+
 
 def wrong_option(error: ValidationError, called: Mapping[str, str] | None = None) -> str:
     """Return the first complaint about options, as the command line calls them.
@@ -42,8 +46,3 @@ def wrong_setting(error: ValidationError) -> str:
     option = f" (--{field.replace('_', '-')})" if field in _ALSO_OPTIONS else ""
     said = complaint(first, repeat=field not in _SECRETS)
     return f"STILLPATH_{field.upper()}{option}: {said}"
-
-
-_ALSO_OPTIONS = ("data_dir", "scheduler", "workers")
-"""Settings that `serve` and `worker` take as options too."""
-_SECRETS = ("database_url", "first_key", "webhook_secret")

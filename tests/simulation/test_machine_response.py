@@ -17,8 +17,8 @@ from stillpath.models.schedule import (
     OperatingPoint,
 )
 from stillpath.models.store import load_machine
+from stillpath.simulation.machine_response import MachineStream
 from stillpath.simulation.response import PlantStream
-from stillpath.simulation.scheduled import MachineStream
 
 DT_S = 1e-3
 M0 = 0.8
