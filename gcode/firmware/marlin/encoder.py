@@ -18,8 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
-from stillpath.gcode.errors import GcodeError
-from stillpath.gcode.firmware.advance import feed_at_ends
 from stillpath.gcode.firmware.base import corner_step_mm_s, square_corner_mm_s
 from stillpath.gcode.firmware.encoding import (
     UNITS_PER_MM,
@@ -37,10 +35,10 @@ from stillpath.gcode.firmware.marlin._encoder_kernels import (
     Blocks,
     assign_rates,
     bend_reversals,
-    spread_advance,
     thin,
 )
 from stillpath.gcode.firmware.marlin.climbing import climb_in_long_moves
+from stillpath.gcode.firmware.marlin.feeding import with_advance, with_placed_steps
 from stillpath.gcode.firmware.marlin.limits import MarlinLimits, advance_speed_mm_s, without_advance
 from stillpath.gcode.firmware.marlin.planner import Planner, planner_facts
 from stillpath.gcode.firmware.marlin.starting import (
@@ -70,8 +68,6 @@ STREAM_E_JERK_MM_S = 100.0
 DEVIATION_MM = (0.01, 0.3)
 """Range of M205 J (Marlin/src/gcode/config/M200-M205.cpp, 2.0.x and 2.1.x)."""
 
-_MOST_FEED = 3.0
-"""Filament per mm of path above which the firmware sees a retraction, without linear advance."""
 _ROOM, _DIAGONAL = 1.05, 1.5
 """Speeds above the command's: of one axis, since vertices lie on whole steps, and of X and Y
 together along a diagonal."""
@@ -165,8 +161,16 @@ class MarlinEncoder:
         self._rate = rate
         facts = planner_facts(firmware, corexy=corexy)
         self._least_hz = float(facts[C_MIN_RATE])
+        by_deviation = firmware.junction == "deviation"
         # With classic jerk a move starts at the jerk's speed, without a slow first step.
-        self._start_hz = self._least_hz if firmware.junction == "deviation" else np.inf
+        self._start_hz = self._least_hz if by_deviation else np.inf
+        axis_limits = [command.of(axis) for axis in ("x", "y")]
+        if all(
+            gentle_accel_mm_s2(one, self._start_hz) == gentle_accel_mm_s2(one, np.inf)
+            for one in axis_limits
+        ):
+            self._start_hz = np.inf
+        self._turns_by_feed = by_deviation and firmware.small_segment_junctions
         self._first_steps = float(facts[C_FIRST_STEPS])
         self._burst = 0.5 * firmware.block_buffer_size
         low, high = steps_within(travel_mm, self._scale)
@@ -203,11 +207,15 @@ class MarlinEncoder:
         limits = stream_limits(own, self._command, self._mesh_slope)
         # The motors' full acceleration is better than a late piece. Where that does not help, what
         # each corner costs adds up faster than its corrections settle.
-        ways = dict.fromkeys([(self._start_hz, 0.0), (np.inf, 0.0), (np.inf, _EARLIER)])
-        for least_hz, earlier in ways:
-            encoded, on_time = self._with_starts(
-                piece, timeline, segments, limits, least_hz, earlier
-            )
+        feeds = self._turns_by_feed
+        ways = [
+            (self._start_hz, 0.0, False),
+            (self._start_hz, 0.0, feeds),
+            (np.inf, 0.0, feeds),
+            (np.inf, _EARLIER, feeds),
+        ]
+        for way in dict.fromkeys(ways):
+            encoded, on_time = self._with_starts(piece, timeline, segments, limits, way)
             if on_time:
                 break
         return encoded
@@ -218,15 +226,24 @@ class MarlinEncoder:
         timeline: Timeline,
         segments: Segments,
         limits: MarlinLimits,
-        least_hz: float,
-        earlier: float,
+        way: tuple[float, float, bool],
     ) -> tuple[Encoded, bool]:
-        """Encode for starts from rest at a step rate; return also whether the motion keeps up.
+        """Encode in one way; return also whether the motion keeps up.
 
-        Lines end `earlier` by that share of their lateness in the pass before, on average.
+        Parameters
+        ----------
+        way : (float, float, bool)
+            Step rate of starts from rest; share of their lateness in the pass before by which
+            lines are to end earlier, on average; whether the steps of E are placed.
         """
+        least_hz, earlier, feeds = way
         on_steps = self._on_steps(timeline, segments, limits, least_hz)
-        segments = self._advanced(piece, timeline, on_steps)
+        segments = with_advance(self._firmware, piece, timeline, on_steps, whole=not feeds)
+        if feeds:
+            accel = gentle_accel_mm_s2(self._command, least_hz)
+            segments = with_placed_steps(
+                timeline, segments, self._scale[3], accel, corexy=self._corexy
+            )
         moves = interleave(piece, timeline, segments, 1)
         moves = self._where_the_file_says(piece, timeline, moves)
         begin_s = float(timeline.start_s[0])
@@ -238,6 +255,7 @@ class MarlinEncoder:
             least_hz=least_hz,
             ahead=self._firmware.block_buffer_size - 3,
             corexy=self._corexy,
+            steps_placed=feeds,
         )
         correction_s = np.zeros(len(moves.row))
         while True:
@@ -303,41 +321,6 @@ class MarlinEncoder:
                 drift_s = uniform_filter1d(late_s, _DRIFT_LINES)
                 early_s += np.where(ours, earlier * drift_s, 0.0)
         return best[1:] if earlier else (feedrate, phases)
-
-    def _advanced(self, piece: Piece, timeline: Timeline, segments: Segments) -> Segments:
-        """Return segments with linear advance in their filament.
-
-        The firmware's own would be lost: it acts during a block's ramps, and those of a stream last
-        a fraction of a step.
-        """
-        limits = cast(list[MarlinLimits], piece.limits)
-        k_s = np.array([x.linear_advance_k_s for x in limits])
-        if self._firmware.linear_advance is False or not np.any(k_s):
-            return segments
-        classic = self._firmware.junction == "classic_jerk"
-        fastest = np.array([advance_speed_mm_s(x, classic_jerk=classic) for x in limits])
-        if self._firmware.linear_advance is None:
-            _check_advance(piece, k_s, fastest)
-        row, feed_mm_s, prints = feed_at_ends(piece, timeline, segments)
-        prints &= piece.phases.direction[row, 3] <= _MOST_FEED
-        which = piece.moves.limits_id[row]
-        end_mm, lead_mm = segments.end_mm.copy(), np.zeros(len(segments))
-        spread_advance(
-            k_s[which] * feed_mm_s,
-            ~prints,
-            fastest[which],
-            segments.end_s,
-            segments.group,
-            timeline.start_s,
-            lead_mm,
-        )
-        # Where E has the most steps, times depend on its rounding, and a stream may start at any E:
-        # so E is put on whole steps, like X and Y.
-        begin_mm = timeline.group_start_mm[segments.group, 3]
-        per_mm = self._scale[3]
-        whole_mm = begin_mm + np.round((end_mm[3] + lead_mm - begin_mm) * per_mm) / per_mm
-        end_mm[3] = np.where(segments.final, end_mm[3], whole_mm)
-        return replace(segments, end_mm=end_mm)
 
     def _where_the_file_says(
         self, piece: Piece, timeline: Timeline, moves: Interleaved
@@ -456,25 +439,3 @@ def _begun_late(encoded: Encoded, moves: Interleaved, timeline: Timeline) -> Enc
         group_start_s=encoded.group_start_s + delay_s,
         row_start_s=encoded.row_start_s + np.repeat(delay_s, counts),
     )
-
-
-def _check_advance(piece: Piece, k_s: NDArray[np.float64], fastest: NDArray[np.float64]) -> None:
-    """Refuse moves that the firmware, but not the plan, would slow down for linear advance."""
-    limits = cast(list[MarlinLimits], piece.limits)
-    own = np.array([(x.accel_x_mm_s2, x.accel_y_mm_s2, x.print_accel_mm_s2) for x in limits])
-    which, direction = piece.moves.limits_id, piece.phases.direction
-    xy = np.abs(direction[:, :2])
-    moves = piece.phases.prints & (direction[:, 3] <= _MOST_FEED)
-    largest = np.min(own[which, :2] / np.maximum(xy, 1e-9), axis=1)
-    accel = np.minimum(largest, own[which, 2])
-    advance = np.where(moves, k_s[which] * direction[:, 3] * accel, 0.0)
-    over = advance > 1.001 * fastest[which]
-    if np.any(over):
-        row = int(np.argmax(over))
-        raise GcodeError(
-            f"linear advance (M900 K{k_s[which[row]]:g}) would drive the extruder by "
-            f"{advance[row]:.1f} mm/s, more than its jerk of {fastest[which[row]]:.1f} mm/s: a "
-            "firmware that has it accelerates less, which is planned where the machine says "
-            "linear_advance true; for one without it say false",
-            line=int(piece.moves.line[row]),
-        )

@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d
 
 from stillpath.gcode.firmware.encoding import Interleaved
 from stillpath.gcode.firmware.marlin.limits import MarlinLimits
@@ -34,6 +35,8 @@ _BEHIND_MM, _TRAVEL_BEHIND_MM = 0.02, 0.06
 """Lag, with and without filament, from which acceleration counts as too low."""
 _CAUSES = 2
 """Number of lines, a late one the last of them, that may have made it late."""
+_UNFED = 17
+"""Lines around one, of which one has filament if it prints and E is on whole steps."""
 
 
 def gentle_accel_mm_s2(axis_limits: CommandLimits, least_hz: float) -> float:
@@ -58,6 +61,8 @@ class StreamLevels:
         The least step rate, which a start from rest begins with.
     ahead : int
         Number of lines in the firmware's queue when one begins, including that one.
+    steps_placed : bool
+        Not every line that prints has a step of E.
 
     Attributes
     ----------
@@ -75,6 +80,7 @@ class StreamLevels:
         least_hz: float,
         ahead: int,
         corexy: bool,
+        steps_placed: bool = False,
     ) -> None:
         axis_limits = [command.of(axis) for axis in ("x", "y")]
         gentle = np.array([gentle_accel_mm_s2(one, least_hz) for one in axis_limits])
@@ -91,7 +97,8 @@ class StreamLevels:
         motors = way @ np.array([[1.0, 1.0], [1.0, -1.0]]) if corexy else way
         steps = np.array([one.speed_step_mm_s for one in axis_limits])
         self._speed_mm_s = np.hypot(*way.T) / span_s
-        self._feeds = np.diff(moves.places_mm()[:, 3]) > 0.0
+        feeds = np.diff(moves.places_mm()[:, 3]) > 0.0
+        self._feeds = maximum_filter1d(feeds, _UNFED) if steps_placed else feeds
         self._fast = np.any(np.abs(motors) / span_s[:, None] > steps, axis=1)
         deviation_mm = stream.junction_deviation_mm
         needed = _needed(way, motors, span_s, self._ours, gentle, deviation_mm)
