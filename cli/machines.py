@@ -312,6 +312,7 @@ def check(
         check_before_job,
         envelope_warnings,
         not_followed,
+        not_planned,
         read_as_older,
     )
     from stillpath.applications.machines.klipper_config import read_printer_config
@@ -326,7 +327,9 @@ def check(
         config=config,
     )
     found += _refused(machine)
-    notes = envelope_warnings(machine) + ([] if config is None else not_followed(config))
+    notes = envelope_warnings(machine)
+    if config is not None:
+        notes += not_followed(config) + not_planned(config)
     if config is not None and any("minimum_cruise_ratio" in line for line in found):
         notes += read_as_older(config)
     for line in [*found, *(f"note: {line}" for line in notes)]:
@@ -355,6 +358,7 @@ def from_config(
     from stillpath.applications.machines.checks import (
         machine_from_config,
         not_followed,
+        not_planned,
         read_as_older,
     )
     from stillpath.applications.machines.klipper_config import read_printer_config
@@ -371,7 +375,7 @@ def from_config(
         expected=0,
     )
     print_revision(revision)
-    for line in [*not_followed(config), *read_as_older(config)]:
+    for line in [*not_followed(config), *read_as_older(config), *not_planned(config)]:
         typer.echo(f"note: {line}")
 
 

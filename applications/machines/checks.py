@@ -27,6 +27,7 @@ __all__ = [
     "envelope_warnings",
     "machine_from_config",
     "not_followed",
+    "not_planned",
     "read_as_older",
     "stated_axis",
     "with_firmware",
@@ -253,6 +254,23 @@ def not_followed(config: PrinterConfig) -> list[str]:
         "macros too, is unknown"
         for name in config.includes
     ]
+
+
+def not_planned(config: PrinterConfig) -> list[str]:
+    """Return a note if G10 lifts the head, as only Kalico's does.
+
+    Source: klippy/extras/firmware_retraction.py of Kalico, 2026-07. Coordinates do not see it.
+    """
+    section, option = "firmware_retraction", "z_hop_height"
+    height_mm = config.number(section, option, 0.0)
+    if height_mm <= 0.0:
+        return []
+    note = (
+        f"[{section}] {option} {height_mm:g}: Kalico lifts the head at each G10 and lowers it at "
+        "G11. These moves are not planned, so prints take longer than reports say, by the time of "
+        "two moves of Z for each retraction; put 0 there and let the slicer lift"
+    )
+    return [note]
 
 
 def read_as_older(config: PrinterConfig) -> list[str]:

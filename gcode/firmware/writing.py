@@ -380,7 +380,8 @@ class StreamWriter:
     def _jump(self, piece: Piece, extruder_mm: float) -> bytes:
         """Return lines to where a piece begins, behind an object's mark."""
         own = piece.limits_before
-        if self._shaper_off:
+        if self._shaper_off or (self._stream_commands.marks and self._switching_off):
+            # A pause behind the line that switches it off must find the mark, too.
             own = self._stream_commands.in_stream(own)
         text = self._stream_commands.limits(own)
         text += self._file_modes(replace(piece.modal_before, absolute_xyz=True, absolute_e=False))

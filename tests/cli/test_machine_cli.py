@@ -377,6 +377,18 @@ def test_an_option_that_older_klippers_understand_otherwise(
     assert differences(machine, read_printer_config(config)) == []
 
 
+@pytest.mark.parametrize("height_mm", [0.0, 0.4])
+def test_a_fork_whose_g10_lifts_the_head(
+    store: MachineStore, config: Path, capsys, height_mm: float
+):
+    """Kalico's: the reports' times lack it."""
+    config.write_text(f"[firmware_retraction]\nz_hop_height: {height_mm}\n{CONFIG}")
+    assert machines("from-config", config, "--name", "lifts") == 0
+    assert ("z_hop_height 0.4: Kalico lifts" in capsys.readouterr().out) is (height_mm > 0.0)
+    machines("check", "lifts", "--printer-cfg", config)
+    assert ("z_hop_height 0.4: Kalico lifts" in capsys.readouterr().out) is (height_mm > 0.0)
+
+
 def test_limits_by_axis_of_a_fork_are_told_apart(store: MachineStore, config: Path, capsys):
     by_axis = "kinematics: limited_corexy\nmax_x_accel: 8000\nmax_y_accel: 3000"
     config.write_text(CONFIG.replace("kinematics: corexy", by_axis))

@@ -250,6 +250,18 @@ def test_a_shaper_that_nobody_states_is_switched_off_again_after_a_pause(
     assert written.count(b"SET_INPUT_SHAPER SHAPER_FREQ_X=0") == 2
 
 
+def test_behind_an_objects_mark_the_limits_are_marked_before_the_shaper_goes_off(
+    pipeline: Pipeline,
+) -> None:
+    """The host waits behind that line. A PAUSE sent then would leave the shaper on at RESUME."""
+    on = "SET_INPUT_SHAPER SHAPER_FREQ_X=40\n"
+    text = f"{HEAD}{on}EXCLUDE_OBJECT_START NAME=a\nG1 X130 Y90 F9000\n{ROUND}"
+    _, _, behind = pipeline(text).partition(on.encode())
+    before = behind.partition(b"\nSET_INPUT_SHAPER SHAPER_FREQ_X=0")[0]
+    assert b"; stillpath: stream on\nSET_VELOCITY_LIMIT" in before
+    assert before.rpartition(b"SQUARE_CORNER_VELOCITY=")[2].startswith(b"5.0000005 ")
+
+
 def test_what_stays_as_sliced_says_that_the_shaper_is_off(
     tmp_path: Path, cache: Path, machine: Machine
 ) -> None:

@@ -145,6 +145,19 @@ def test_parking_moves_have_printer_cfgs_acceleration(
     assert len(moves) - len(parking) == len(plain.moves)
 
 
+def test_a_pause_where_a_stream_begins_leaves_the_shaper_off(plain: Print, tmp_path: Path) -> None:
+    """Behind the line that switches it off the host waits, and a PAUSE with it."""
+    off = next(
+        x for x in plain.text.split("\n") if x.startswith("SET_INPUT_SHAPER SHAPER_FREQ_X=0")
+    )
+    before, _, behind = plain.text.partition(f"{off}\nG4 P0 ; stand still\n")
+    assert behind
+    text = f"{before}{off}\nG4 P0\nPAUSE\nRESUME\n{behind}"
+    _, told = planned(text, plain.machine, USERS + OURS, tmp_path)
+    # The file; PAUSE, RESUME twice, the last time as it was; the file.
+    assert told == ["0.000", "57.800", "57.800", "0.000", "57.800"]
+
+
 def test_without_our_macros_they_have_the_streams(plain: Print, tmp_path: Path) -> None:
     text = interrupted(plain.text, "PAUSE\nRESUME")
     moves, _ = planned(text, plain.machine, USERS, tmp_path)
