@@ -199,6 +199,7 @@ def _single_rate(loops: tuple[Loop, ...], o: WideOptions | QuasiOptions, _: Loop
         alpha=o.alpha,
         nyquist_pairs=o.nyquist_pairs,
         notches_hz=o.notches_hz,
+        compared=o.compared,
         uncertainty=o.uncertainty,
     )
 
@@ -211,6 +212,7 @@ def _multirate(loops: tuple[Loop, ...], o: MultirateOptions, _: LoopSpec) -> Con
         alpha=o.alpha,
         nyquist_pairs=o.nyquist_pairs,
         notches_hz=o.notches_hz,
+        compared=o.compared,
         uncertainty=o.uncertainty,
     )
 

@@ -152,7 +152,17 @@ class MmpOptions(_Options):
 
 
 class _Repetitive(_Options):
+    """What the repetitive methods share.
+
+    Attributes
+    ----------
+    compared : "response" or "reference"
+        Whether the error is the output less the loop's response to the reference, or less the
+        reference itself; `compensation.feedback.repetitive.Compared`.
+    """
+
     fundamental_hz: Frequency
+    compared: Literal["response", "reference"] = "response"
     nyquist_pairs: Annotated[int, Field(ge=0, le=20)] = 3
     notches_hz: Annotated[tuple[Frequency, ...], Field(max_length=8)] = ()
 

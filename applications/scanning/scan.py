@@ -123,7 +123,7 @@ def scan_file(
     if settings.prefilter != "none":
         outputs["prefilter"] = (prefilter.label, plain.run(command, wanted))
     if controller is not None:
-        added = _Drive.with_controller(loop, sensor, controller, disturbed, warm_up)
+        added = _Drive(loop, sensor, controller.blocks, controller.every, disturbed, warm_up)
         label = f"{prefilter.label} and {controller.method}".removeprefix("none and ")
         outputs["add-on"] = (label, added.run(command, wanted))
     errors = {
@@ -224,19 +224,6 @@ class _Drive:
         self._loop, self._sensor, self._blocks = loop, sensor, blocks
         self._every, self._disturbed, self._warm_up = every, disturbed, warm_up
 
-    @classmethod
-    def with_controller(
-        cls,
-        loop: Loop,
-        sensor: SensorSpec | None,
-        controller: LoadedController,
-        disturbed: _Disturbed | None,
-        warm_up: int,
-    ) -> _Drive:
-        """Return the loop with an add-on as a controller would load it."""
-        blocks = _expecting(controller.blocks, loop, controller.every)
-        return cls(loop, sensor, blocks, controller.every, disturbed, warm_up)
-
     def run(self, reference: Array, wanted: Array) -> Array:
         """Return the output, shape (2, n), of a machine at rest at the start of the path."""
         return np.array(
@@ -250,24 +237,6 @@ class _Drive:
             inputs[place] = np.repeat(self._disturbed.d_um, self._every)
         y = simulate(self._loop, self._blocks, inputs, every=self._every, sensor=self._sensor)["y"]
         return y[:: self._every][self._warm_up :]
-
-
-def _expecting(blocks: Sequence[Block], loop: Loop, every: int) -> tuple[Block, ...]:
-    """Let an add-on compare the output with the expected one instead of the reference.
-
-    A plug-in on the control error would mistake the lead of a prefilter's reference for an error.
-    """
-    compared = [b for b in blocks if ("ym", 1.0) in b.inputs and ("r", -1.0) in b.inputs]
-    if not compared:
-        return tuple(blocks)
-    expected = Block("expected", (("r", 1.0),), loop.tracking_num, loop.t0_den, every=every)
-    changed = [
-        replace(b, inputs=tuple(("expected" if name == "r" else name, g) for name, g in b.inputs))
-        if b in compared
-        else b
-        for b in blocks
-    ]
-    return (expected, *changed)
 
 
 def _machine(spec: LoopSpec) -> tuple[object, object]:

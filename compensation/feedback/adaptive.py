@@ -134,7 +134,7 @@ class AdaptiveFmsdob:
         floor_rms: float = 1e-6,
     ) -> None:
         self._loops, self._tones = tuple(loops), tones
-        self._bandwidth_hz = bandwidth_hz
+        self._bandwidth_hz, self._floor_rms = bandwidth_hz, floor_rms
         self.tracker = FrequencyTracker(tones, loops[0].dt_s, floor_rms)
         top = 0.5 / loops[0].dt_s
         self._idle = tuple(top * (i + 1) / (tones + 1) for i in range(tones))
@@ -176,7 +176,7 @@ class AdaptiveFmsdob:
             If there are no targets, or the design is refused.
         """
         if not self._tuned:
-            raise DesignError("no tone is identified at present")
+            raise DesignError(f"fmsdob-adaptive on {self._loops[0].name!r}: {self._why_silent()}")
         return fmsdob(self._loops, self._tuned, bandwidth_hz=self._bandwidth_hz)
 
     def _retuned(self, targets: tuple[float, ...]) -> Retuning | None:
@@ -196,6 +196,21 @@ class AdaptiveFmsdob:
             return None
         far = _apart(targets, before) > 0.5 * self._bandwidth_hz
         return Retuning(q.blocks("dhat", "c"), reset=far)
+
+    def _why_silent(self) -> str:
+        heard = ", ".join(f"{f:.5g}" for f in self._last)
+        if not self._last:
+            return (
+                f"nothing of more than floor_rms {self._floor_rms:g} rms is heard, or a tone has "
+                "just jumped; lower floor_rms, or let it run longer"
+            )
+        if self._refused:
+            return f"{heard} Hz are heard, but cannot be rejected together; take fewer tones"
+        return (
+            f"what is heard as {heard} Hz still moves by more than "
+            f"{0.25 * self._bandwidth_hz:g} Hz a time: it is noise, or its tones are not "
+            f"{self._tones}; change tones, or raise floor_rms above the noise"
+        )
 
     def _silent(self) -> QFilter:
         q = design_q(self._loops[0], self._idle, bandwidth_hz=self._bandwidth_hz)

@@ -28,10 +28,12 @@ from stillpath.compensation.feedback.controller import (
     judged,
 )
 from stillpath.compensation.feedback.repetitive import (
+    Compared,
     InternalModel,
     ServoInverse,
     internal_model,
     invert_servo,
+    observed_error,
     repetitive_blocks,
     repetitive_coefficients,
     shared_period,
@@ -62,6 +64,7 @@ def design_multirate(
     alpha: float = 0.999,
     nyquist_pairs: int = 3,
     notches_hz: Sequence[float] = (),
+    compared: Compared = "response",
     uncertainty: Uncertainty | None = None,
 ) -> Controller:
     """Design a repetitive controller at the fast rate.
@@ -72,7 +75,7 @@ def design_multirate(
         At the sampling rate: the nominal loop, then the members of its plant set.
     fast : Loop
         The same machine, identified at the fast rate; its servo is inverted.
-    alpha, nyquist_pairs, notches_hz, uncertainty
+    alpha, nyquist_pairs, notches_hz, compared, uncertainty
         See `compensation.feedback.repetitive.design_wide_band`.
 
     Raises
@@ -92,9 +95,10 @@ def design_multirate(
     model = internal_model(fast.dt_s, rates.period, alpha, nyquist_pairs, notches_hz)
     inverse = invert_servo(fast.servo_num, fast.t0_den)
     model = replace(model, mean_free=inverse.blocks_constants)
-    upsampled = Block("up", (("ym", 1.0), ("r", -1.0)), every=rates.factor, zero_between=True)
+    expected, error = observed_error(nominal, compared, rates.factor)
+    upsampled = Block("up", error, every=rates.factor, zero_between=True)
     kept = Block("c", (("w", 1.0),), every=rates.factor)
-    blocks = (upsampled, *repetitive_blocks(model, inverse, (("up", 1.0),), "w"), kept)
+    blocks = (*expected, upsampled, *repetitive_blocks(model, inverse, (("up", 1.0),), "w"), kept)
     targets = np.arange(fundamental_hz, 0.5 / nominal.dt_s, fundamental_hz)
     widths = np.full(len(targets), 0.05 * fundamental_hz)
     f = frequency_grid(nominal.dt_s, targets.tolist(), widths.tolist())
@@ -107,7 +111,7 @@ def design_multirate(
         every=rates.factor,
         settings={"fundamental_hz": fundamental_hz, "alpha": alpha, "period": rates.period,
                   "nyquist_pairs": nyquist_pairs, "notches_hz": tuple(notches_hz),
-                  "factor": rates.factor, "fast_rate_hz": rates.rate_hz},
+                  "compared": compared, "factor": rates.factor, "fast_rate_hz": rates.rate_hz},
         notes=inverse.notes,
     )  # fmt: skip
     return judged(design, loops, uncertainty)

@@ -28,6 +28,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -49,6 +50,7 @@ from stillpath.models.diagrams import Block, polynomial_response
 from stillpath.models.loops import Loop
 
 __all__ = [
+    "Compared",
     "InternalModel",
     "ServoInverse",
     "design_quasi",
@@ -57,6 +59,7 @@ __all__ = [
     "instant_margin",
     "internal_model",
     "invert_servo",
+    "observed_error",
     "periodic_residual",
     "plug_in_factor",
     "repetitive_blocks",
@@ -64,6 +67,10 @@ __all__ = [
     "shared_period",
 ]
 
+Compared = Literal["response", "reference"]
+"""Whether the error is the output less the loop's response to the reference, which leaves every
+reference as it is, or less the reference itself (the paper's figure 2), which makes the output
+follow periodic references but takes the lead of a prefiltered one for an error."""
 _RADIUS = 0.97
 _SERIES_LEFT = 1e-3
 _LARGEST_PERIOD = 1000
@@ -181,6 +188,7 @@ def design_wide_band(
     alpha: float = 0.8,
     nyquist_pairs: int = 3,
     notches_hz: Sequence[float] = (),
+    compared: Compared = "response",
     uncertainty: Uncertainty | None = None,
 ) -> Controller:
     """Design with the period rounded to whole samples and the notches widened.
@@ -191,6 +199,8 @@ def design_wide_band(
         The nominal loop, then the members of its plant set.
     notches_hz : sequence of float
         Frequencies at which the add-on has no effect.
+    compared
+        See `Compared`.
     uncertainty
         See `compensation.feedback.controller.judged`.
 
@@ -203,7 +213,7 @@ def design_wide_band(
     model = internal_model(loops[0].dt_s, period, alpha, nyquist_pairs, notches_hz)
     asked = {"fundamental_hz": fundamental_hz, "alpha": alpha, "nyquist_pairs": nyquist_pairs,
              "notches_hz": tuple(notches_hz)}  # fmt: skip
-    return _designed("rc-wide", loops, model, fundamental_hz, asked, uncertainty)
+    return _designed("rc-wide", loops, model, fundamental_hz, asked, compared, uncertainty)
 
 
 def design_quasi(
@@ -213,6 +223,7 @@ def design_quasi(
     alpha: float = 0.999,
     nyquist_pairs: int = 3,
     notches_hz: Sequence[float] = (),
+    compared: Compared = "response",
     uncertainty: Uncertainty | None = None,
 ) -> Controller:
     """Design for the greatest common divisor of fundamental and sampling rate.
@@ -235,7 +246,9 @@ def design_quasi(
              "alpha": alpha, "nyquist_pairs": nyquist_pairs,
              "notches_hz": tuple(notches_hz)}  # fmt: skip
     note = f"one notch of {share.numerator} lies on the disturbance"
-    return _designed("rc-quasi", loops, model, fundamental_hz, asked, uncertainty, (note,))
+    return _designed(
+        "rc-quasi", loops, model, fundamental_hz, asked, compared, uncertainty, (note,)
+    )
 
 
 def shared_period(rate_hz: float, fundamental_hz: float) -> Fraction:
@@ -366,6 +379,16 @@ def repetitive_blocks(
     return generator, Block(target, (("rc", 1.0),), inverse.num, inverse.den)
 
 
+def observed_error(
+    loop: Loop, compared: Compared, every: int = 1
+) -> tuple[tuple[Block, ...], tuple[tuple[str, float], ...]]:
+    """Return blocks, and the signals and gains whose sum is the error; ticks as `Loop.blocks`."""
+    if compared == "reference":
+        return (), (("ym", 1.0), ("r", -1.0))
+    expected = Block("expected", (("r", 1.0),), loop.tracking_num, loop.t0_den, every=every)
+    return (expected,), (("ym", 1.0), ("expected", -1.0))
+
+
 def instant_margin(loop: Loop, model: InternalModel, harmonics_hz: Sequence[float]) -> Extreme:
     """Return min 1/|T| in closed form: around a narrow notch T follows a circle.
 
@@ -412,13 +435,15 @@ def _designed(
     model: InternalModel,
     fundamental_hz: float,
     asked: dict[str, object],
+    compared: Compared,
     uncertainty: Uncertainty | None,
     notes: tuple[str, ...] = (),
 ) -> Controller:
     nominal = loops[0]
     inverse = invert_servo(nominal.servo_num, nominal.t0_den)
     model = replace(model, mean_free=inverse.blocks_constants)
-    blocks = repetitive_blocks(model, inverse, (("ym", 1.0), ("r", -1.0)), "c")
+    expected, error = observed_error(nominal, compared)
+    blocks = (*expected, *repetitive_blocks(model, inverse, error, "c"))
     targets = np.arange(fundamental_hz, 0.5 / nominal.dt_s, fundamental_hz)[:64]
     widths = np.full(len(targets), max(0.05 * fundamental_hz, 1.0))
     f = frequency_grid(nominal.dt_s, targets.tolist(), widths.tolist())
@@ -430,7 +455,7 @@ def _designed(
         blocks,
         Prediction(f, nominal.s0(f), factor),
         repetitive_coefficients(model, inverse),
-        settings=asked | {"period": model.period},
+        settings=asked | {"compared": compared, "period": model.period},
         notes=(*inverse.notes, *notes),
     )
     return judged(design, loops, uncertainty)

@@ -245,7 +245,12 @@ REFUSED: list[tuple[str, dict[str, Any], str]] = [
     ("galvo-40khz", {"method": "rc-quasi", "fundamental_hz": 1201}, "rc-wide"),
     ("galvo-40khz", {"method": "rc-wide", "fundamental_hz": 20}, "take a multiple of the fund"),
     ("galvo-40khz", FMSDOB | {"duration_s": 50}, "200000"),
-    ("galvo-10khz", {"method": "fmsdob-adaptive", "floor_rms": 100}, "no tone"),
+    ("galvo-10khz", {"method": "fmsdob-adaptive", "floor_rms": 100}, "floor_rms 100 rms is heard"),
+    (
+        "galvo-10khz",
+        {"method": "fmsdob-adaptive", "disturbance": {"kind": "wideband", "floor_rms": 0.01}},
+        r"galvo-10khz.*Hz still moves by more than 12.5 Hz.*its tones are not 1; change tones",
+    ),
     ("galvo-10khz", {"method": "fmsdob-adaptive", "uncertainty": 2}, "allows"),
     (
         "galvo-10khz",

@@ -27,6 +27,7 @@ from stillpath.compensation.feedback.zero_phase import design_prefilter
 from stillpath.gcode.hatches import Timing, read_hatches, sample_hatches
 from stillpath.models.disturbances import Narrowband, SensorSpec, Tone
 from stillpath.models.loops import Loop, LoopSpec, builtin_loops, load_loop
+from stillpath.simulation.closed_loop import simulate
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "hatch.gcode"
 SCALED = ScanSettings(um_per_unit=2500)
@@ -113,6 +114,19 @@ def test_repetitive_add_on_is_not_disturbed_by_the_prefilter() -> None:
     quiet = ScanSettings(um_per_unit=2500, disturbance_um=0)
     left = by_name(scan_file(EXAMPLE, load_loop(name), quiet, add_on(name)).report)
     assert left["add-on"] == pytest.approx(left["prefilter"], rel=1e-6)
+
+
+def test_the_predicted_repetitive_add_on_is_the_written_one() -> None:
+    """The scan's own command, played into the written equations, gives the predicted error."""
+    spec = load_loop("direct-drive-table")
+    options = read_options({"method": "rc-quasi", "fundamental_hz": 100})
+    loaded = read_controller(json.dumps(design_controller(spec, options).report.controller))
+    made = scan_file(EXAMPLE, spec, ScanSettings(disturbance_um=0), loaded)
+    r = 1e3 * made.command[0]
+    plain, y = (simulate(spec.nominal(), b, {"r": r})["y"] for b in ((), loaded.blocks))
+    np.testing.assert_allclose(y, plain, atol=1e-6 * np.abs(r).max())
+    left = by_name(made.report)
+    assert left["add-on"] == pytest.approx(left["prefilter"], rel=1e-3)
 
 
 def test_command_drives_the_loop_along_the_path() -> None:

@@ -144,7 +144,7 @@ def test_kernel_is_the_textbook_recursion() -> None:
 
 def test_controller_of_the_present() -> None:
     observer = AdaptiveFmsdob(SPEC.loops(), 1)
-    with pytest.raises(DesignError, match="no tone"):
+    with pytest.raises(DesignError, match="more than floor_rms 1e-06 rms is heard"):
         observer.controller()
     x = np.sin(2 * np.pi * 0.07 * np.arange(2000))
     for i in range(0, 2000, STEP):

@@ -140,6 +140,27 @@ def test_simulation_meets_the_prediction(kind: str) -> None:
     assert made.multiplications < 40
 
 
+@pytest.mark.parametrize("kind", ["quasi", "multirate"])
+def test_references_are_left_alone_or_followed(kind: str) -> None:
+    """By default y = T0 r, whatever r; against the reference itself, y follows a periodic r."""
+    every = 3 if kind == "multirate" else 1
+    t = np.arange(16_000) / 16e3
+    r = np.repeat(np.sin(2 * np.pi * 1200.0 * t + 1.0), every)
+    plain = simulate(NOMINAL, (), {"r": r[::every]})["y"]
+    left = {}
+    for compared in ("response", "reference"):
+        made = (
+            design_multirate(LOOPS, FAST, 1200.0, compared=compared)
+            if kind == "multirate"
+            else design_quasi(LOOPS, 1200.0, compared=compared)
+        )
+        y = simulate(NOMINAL, made.blocks, {"r": r}, every=every)["y"][::every]
+        left[compared] = np.abs(y - r[::every])[-2000:].max()
+        if compared == "response":
+            np.testing.assert_allclose(y, plain, atol=1e-9)
+    assert left["reference"] < 0.2 * left["response"]
+
+
 def test_multirate_beats_the_others_also_on_plants_that_differ() -> None:
     made = {
         "quasi": (design_quasi(LOOPS, 1200.0), 1),
