@@ -20,6 +20,7 @@ __all__ = [
     "activate_extruder",
     "exclude_object",
     "gcode_offset",
+    "perhaps_macro",
     "reset_velocity_limit",
     "restore_state",
     "save_state",
@@ -67,6 +68,23 @@ def velocity_limit(state: MachineState, command: Command, *, capped: bool = Fals
     further = given.keys() - _LIMITS.keys()
     kind = EventKind.STATE if further else EventKind.LIMITS
     return state.set_limits(command, _held(state, values) if capped else values, kind=kind)
+
+
+def perhaps_macro(state: MachineState, command: Command) -> int:
+    """Another firmware's word, which Klipper passes over; many printers have a macro for it.
+
+    Creality's M205 sets the corner velocity, their M900 pressure advance, and the M300 of Klipper's
+    own examples waits (CrealityOfficial/K1_Series_Klipper, config/*/gcode_macro.cfg, 2024;
+    Klipper3d/klipper, config/printer-sunlu-t3-2022.cfg, 2026-08).
+    """
+    if state.i[at.I_KNOWN] & 3 == 3 and state.firmware.unknown_commands != "skip":
+        state.warn(
+            f"{command.name} in the middle of the print: Klipper passes over it, but if yours has "
+            "a macro of that name, as many makers' printers have, it sets limits or waits in the "
+            f"middle of a stream; put {command.name} among the machine's macros (firmware section) "
+            "if there is one, or else among harmless_macros"
+        )
+    return state.event(EventKind.HARMLESS)
 
 
 def reset_velocity_limit(state: MachineState, _command: Command) -> int:
