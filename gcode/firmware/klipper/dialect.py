@@ -132,6 +132,9 @@ FOREIGN: dict[str, Word] = {
     **words("M201 M203 M205 M300 M572 M593 M900", commands.perhaps_macro),
 }
 
+MACROS: dict[str, Word] = {"M205": commands.corner_macro}
+"""What is known of macros with another firmware's word for a name, if a machine names them."""
+
 _NAME = re.compile(r"^[A-Z_][A-Z0-9_.]*$")
 
 
@@ -154,7 +157,7 @@ def klipper(firmware: Klipper) -> Dialect:
         **({} if firmware.arcs else NO_ARCS),
         **({} if firmware.retraction else NO_RETRACTION),
         **FOREIGN,
-        **{name.upper(): EventKind.UNKNOWN for name in firmware.macros},
+        **{name.upper(): MACROS.get(name.upper(), EventKind.UNKNOWN) for name in firmware.macros},
         **NATIVE,
         **{name.upper(): EventKind.STOP for name in firmware.stopping_macros},
         **{name.upper(): EventKind.HARMLESS for name in firmware.harmless_macros},
