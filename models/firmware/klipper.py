@@ -100,7 +100,7 @@ class Klipper(FirmwareFacts):
     """None: unknown. It is switched off for our moves and stays off, and the report says so."""
     macros: tuple[str, ...] = ()
     """Configured macros with the name of another firmware's word, such as M205 or M900: they may do
-    anything."""
+    anything. M205 also sets the corner velocity."""
 
     limits_capped: bool = False
     """SET_VELOCITY_LIMIT and M204 set no speed and no acceleration above those of `planner`, as on

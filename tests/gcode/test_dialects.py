@@ -724,6 +724,27 @@ def test_a_macro_of_that_name_is_the_users(read) -> None:
     assert read("G2 X9 I2\nG10\n", "klipper", **macros)[1].warnings == []
 
 
+def test_a_word_that_printers_have_as_a_macro_is_told(read) -> None:
+    """Creality's M205 sets the corner velocity, and would within a stream."""
+    text = "M205 X8\nG1 X5 Y5 F600\nM205 X500\nG1 X9\nM205 X50\n"  # the first one at the start
+    block, interpreter = read(text, "klipper", homed_at_start=False)
+    assert block.events.kind.tolist() == [EventKind.HARMLESS] * 3
+    (said,) = interpreter.warnings
+    assert said.startswith("line 3: M205 in the middle of the print")
+    named = ({"macros": ("M205",)}, {"harmless_macros": ("M205",)}, {"unknown_commands": "skip"})
+    assert all(read(text, "klipper", **fields)[1].warnings == [] for fields in named)
+
+
+@pytest.mark.parametrize(
+    ("line", "corner_mm_s"), [("M205 X20 Y15", 20.0), ("M205 Y15", 15.0), ("M205 B1", 5.0)]
+)
+def test_a_macro_m205_sets_the_corner_velocity(read, line: str, corner_mm_s: float) -> None:
+    """As those of Creality do, whose files have it at each feature; and like any macro may move."""
+    block, _ = read(f"G1 X5 F600\n{line}\nG1 X9\n", "klipper", macros=("m205",))
+    assert block.limits[block.events.limits_id[-1]].square_corner_velocity_mm_s == corner_mm_s
+    assert block.events.kind.tolist() == [EventKind.UNKNOWN]
+
+
 def test_a_limit_of_older_klippers_is_told_once(read) -> None:
     line = "SET_VELOCITY_LIMIT ACCEL=2000 ACCEL_TO_DECEL=1000"
     _, interpreter = read(f"G1 X5 F600\n{line}\n{line} ; again\n", "klipper")

@@ -18,8 +18,10 @@ from stillpath.gcode.types import EventKind
 __all__ = [
     "acceleration",
     "activate_extruder",
+    "corner_macro",
     "exclude_object",
     "gcode_offset",
+    "perhaps_macro",
     "reset_velocity_limit",
     "restore_state",
     "save_state",
@@ -67,6 +69,37 @@ def velocity_limit(state: MachineState, command: Command, *, capped: bool = Fals
     further = given.keys() - _LIMITS.keys()
     kind = EventKind.STATE if further else EventKind.LIMITS
     return state.set_limits(command, _held(state, values) if capped else values, kind=kind)
+
+
+def perhaps_macro(state: MachineState, command: Command) -> int:
+    """Another firmware's word, which Klipper passes over; many printers have a macro for it.
+
+    Creality's M205 sets the corner velocity, their M900 pressure advance, and the M300 of Klipper's
+    own examples waits (CrealityOfficial/K1_Series_Klipper, config/*/gcode_macro.cfg, 2024;
+    Klipper3d/klipper, config/printer-sunlu-t3-2022.cfg, 2026-08).
+    """
+    if state.i[at.I_KNOWN] & 3 == 3 and state.firmware.unknown_commands != "skip":
+        state.warn(
+            f"{command.name} in the middle of the print: Klipper passes over it, but if yours has "
+            "a macro of that name, as many makers' printers have, it sets limits or waits in the "
+            f"middle of a stream; put {command.name} among the machine's macros (firmware section) "
+            "if there is one, or else among harmless_macros"
+        )
+    return state.event(EventKind.HARMLESS)
+
+
+def corner_macro(state: MachineState, command: Command) -> int:
+    """M205 where the machine names a macro of it: the corner velocity becomes X, or else Y.
+
+    So do all of 79 printers' that were looked at (Creality's K1, K2 and Ender-3 V3, Elegoo's
+    Neptune 4, Klippain; 2023 to 2026). As any macro it may do more.
+    """
+    given = state.numbers(command, "XY")
+    corner_mm_s = given.get("X", given.get("Y", -1.0))
+    values = {"square_corner_velocity_mm_s": corner_mm_s} if corner_mm_s >= 0.0 else {}
+    state.settle()
+    state.macro_ran = True
+    return state.set_limits(command, values, kind=EventKind.UNKNOWN)
 
 
 def reset_velocity_limit(state: MachineState, _command: Command) -> int:

@@ -118,18 +118,23 @@ NATIVE: dict[str, Word] = {
     ),
 }
 
-FOREIGN: dict[str, Word] = words(
+FOREIGN: dict[str, Word] = {
     # Words of other firmwares that slicers write into every file.
-    "G17 G18 G19 G26 M3 M4 M5 M17 M72 M74 M75 M76 M77 M80 M81 M92 M108 M113 M126 M127 M141 M142 "
-    "M145 M149 M150 M155 M200 M201 M202 M203 M205 M206 M207 M208 M209 M211 M218 M300 M301 M302 "
-    "M303 M304 M355 M420 M500 "
-    "M501 M502 M503 M556 M557 M558 M566 M569 M571 M572 M573 M574 M579 M581 M582 M584 M587 M593 "
-    "M595 M605 M620 M621 M622 M623 M624 M625 M710 M851 M862.1 M862.2 M862.3 M862.4 M862.5 "
-    "M862.6 "
-    "M900 M906 M907 M913 M914 M950 M960 M970.3 M971 M973 M974 M975 M981 M982 M983 M1002 "
-    "G92.1 G60 M861 M863 M864 M865 M221.1 M142.1",
-    EventKind.HARMLESS,
-)
+    **words(
+        "G17 G18 G19 G26 M3 M4 M5 M17 M72 M74 M75 M76 M77 M80 M81 M92 M108 M113 M126 M127 M141 "
+        "M142 M145 M149 M150 M155 M200 M202 M206 M207 M208 M209 M211 M218 M301 M302 M303 "
+        "M304 M355 M420 M500 M501 M502 M503 M556 M557 M558 M566 M569 M571 M573 M574 M579 M581 "
+        "M582 M584 M587 M595 M605 M620 M621 M622 M623 M624 M625 M710 M851 M862.1 M862.2 M862.3 "
+        "M862.4 M862.5 M862.6 M906 M907 M913 M914 M950 M960 M970.3 M971 M973 M974 M975 M981 M982 "
+        "M983 M1002 G92.1 G60 M861 M863 M864 M865 M221.1 M142.1",
+        EventKind.HARMLESS,
+    ),
+    # The same, but printers have macros of these names, which set limits or wait.
+    **words("M201 M203 M205 M300 M572 M593 M900", commands.perhaps_macro),
+}
+
+MACROS: dict[str, Word] = {"M205": commands.corner_macro}
+"""What is known of macros with another firmware's word for a name, if a machine names them."""
 
 _NAME = re.compile(r"^[A-Z_][A-Z0-9_.]*$")
 
@@ -153,7 +158,7 @@ def klipper(firmware: Klipper) -> Dialect:
         **({} if firmware.arcs else NO_ARCS),
         **({} if firmware.retraction else NO_RETRACTION),
         **FOREIGN,
-        **{name.upper(): EventKind.UNKNOWN for name in firmware.macros},
+        **{name.upper(): MACROS.get(name.upper(), EventKind.UNKNOWN) for name in firmware.macros},
         **NATIVE,
         **{name.upper(): EventKind.STOP for name in firmware.stopping_macros},
         **{name.upper(): EventKind.HARMLESS for name in firmware.harmless_macros},
