@@ -153,10 +153,13 @@ class Connection:
         deadline, pause_s = time.monotonic() + self._patience_s, FIRST_PAUSE_S
         restarts_left = _MAX_RESTARTS
         while True:
+            began = time.monotonic()
             try:
                 return ask()
             except Broken as error:
-                if error.midway and restarts_left:
+                # To send a large file may take all patience, before the service says it is busy.
+                is_long = error.answered and time.monotonic() - began > self._patience_s / 2
+                if (error.midway or is_long) and restarts_left:
                     deadline = time.monotonic() + self._patience_s
                     restarts_left -= 1
                 wait_s = max(pause_s, error.pause_s or 0.0)

@@ -36,6 +36,8 @@ _REFUSED = {
     JobKind.LIVE: "Live printing not available",
 }
 """Titles of requests that cannot be computed."""
+_SMALLER = "Limit the size of the result (max_mb), cut the print into several files"
+"""What helps where a result is too large: it may have ten times the size of the upload."""
 
 
 def problem(status: int, title: str, detail: str, **extra: Any) -> dict[str, Any]:
@@ -94,7 +96,7 @@ def problem_of(error: BaseException, kind: JobKind = JobKind.COMPENSATION) -> di
                 507,
                 FILE_TOO_LARGE,
                 "A file of the job became larger than the file system of the data directory or of "
-                "the storage allows. Cut the print into several files.",
+                f"the storage allows. {_SMALLER}, or give them one that allows more.",
             )
         case _:
             return problem(
@@ -126,8 +128,8 @@ def never_fits(room_bytes: int, total_bytes: int) -> dict[str, Any]:
         507,
         "The job is larger than the disk",
         f"It had written {room_bytes >> 20} MiB when the disk was full; the disk of the worker has "
-        f"{total_bytes >> 20} MiB in all, and some stay free (STILLPATH_DISK_RESERVE_BYTES). Cut "
-        "the print into several files, or give the service a larger disk.",
+        f"{total_bytes >> 20} MiB in all, and some stay free (STILLPATH_DISK_RESERVE_BYTES). "
+        f"{_SMALLER}, or give the service a larger disk.",
     )
 
 
@@ -137,8 +139,7 @@ def storage_never_fits(room_bytes: int, total_bytes: int) -> dict[str, Any]:
         507,
         "The job is larger than the disk",
         f"Its result has {room_bytes >> 20} MiB, and the disk of the storage {total_bytes >> 20} "
-        "MiB in all (STILLPATH_STORAGE_URL). Cut the print into several files, or give the storage "
-        "a larger disk.",
+        f"MiB in all (STILLPATH_STORAGE_URL). {_SMALLER}, or give the storage a larger disk.",
     )
 
 

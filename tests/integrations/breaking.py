@@ -1,4 +1,4 @@
-"""A server whose connection breaks off while an upload comes, the first time."""
+"""A server that does not take an upload the first time: it breaks off, or the server is busy."""
 
 from __future__ import annotations
 
@@ -18,8 +18,13 @@ TAKES_S = 0.8
 
 
 @contextmanager
-def breaking_server(job: dict[str, object]) -> Iterator[tuple[str, list[str]]]:
-    """Give its address, and the keys of the uploads that came; answer the second with a job."""
+def breaking_server(
+    job: dict[str, object], *, busy: bool = False
+) -> Iterator[tuple[str, list[str]]]:
+    """Give its address, and the keys of the uploads that came; answer the second with a job.
+
+    The first breaks off; `busy`: it comes, and is answered 503.
+    """
     keys: list[str] = []
 
     class Handler(http.server.BaseHTTPRequestHandler):
@@ -29,11 +34,11 @@ def breaking_server(job: dict[str, object]) -> Iterator[tuple[str, list[str]]]:
             for _ in range(10 if len(keys) == 1 else 0):
                 left -= len(self.rfile.read(1 << 16))
                 time.sleep(TAKES_S / 10)
-            if len(keys) == 1:
+            if len(keys) == 1 and not busy:
                 return  # what has come and was not read makes it a reset
             self.rfile.read(left)
             text = json.dumps(job | {"source_bytes": len(BODY)}).encode()
-            self.send_response(202)
+            self.send_response(503 if len(keys) == 1 else 202)
             self.send_header("Content-Length", str(len(text)))
             self.end_headers()
             self.wfile.write(text)

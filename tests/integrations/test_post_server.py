@@ -333,11 +333,12 @@ def test_a_result_without_its_report(running: Running, part: Path, tmp_path: Pat
     assert_untouched(part, DONE)
 
 
-def test_a_long_upload_that_breaks_off_is_sent_again(tmp_path: Path):
+@pytest.mark.parametrize("busy", [False, True])
+def test_a_long_upload_that_breaks_off_is_sent_again(tmp_path: Path, busy: bool):
     """Also where it took longer than the patience with a server that is silent."""
     part = tmp_path / "part.gcode"
     part.write_bytes(BODY)
-    with breaking_server({"id": "7"}) as (address, keys):
+    with breaking_server({"id": "7"}, busy=busy) as (address, keys):
         service = stillpath_post.Service(address, timeout_s=0.5 * TAKES_S)
         assert service._send(part, {"machine": "ender3", "name": part.name}) == "7"
     assert len(keys) == 2

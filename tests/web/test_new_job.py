@@ -448,9 +448,18 @@ def test_a_key_is_asked_for_and_goes_along(guarded: Service, visitor: Visitor, t
     hand_in(page, file)
     expect(page.locator(".headline")).to_contain_text("explain what is known of the machine")
     expect(page.locator(".stage:not([aria-busy])")).to_be_visible()
+    # The page fetches it itself, so it tells how far that is.
+    network = page.context.new_cdp_session(page)
+    slow = {"offline": False, "latency": 0, "downloadThroughput": 200_000, "uploadThroughput": -1}
+    network.send("Network.emulateNetworkConditions", slow)
+    link = page.get_by_role("link", name=re.compile("^G-code"))
     with page.expect_download() as download:
-        page.get_by_role("link", name=re.compile("^G-code")).click()
+        link.click()
+        expect(link).to_have_text(re.compile(r"^G-code \(.*\): \d+ %$"))
+        network.send("Network.emulateNetworkConditions", slow | {"downloadThroughput": -1})
     assert download.value.suggested_filename == "gear.stillpath.gcode"
+    assert b"; Processed by stillpath" in Path(download.value.path()).read_bytes()
+    expect(link).to_have_text(re.compile(r"^G-code \(.* MB\)$"))
     # The key is in the tab and nowhere else: neither in an address nor in lasting storage.
     assert KEY not in page.url
     assert KEY not in page.evaluate("JSON.stringify({...localStorage}) + document.cookie")

@@ -223,12 +223,15 @@ class Service:
         deadline, pause_s = time.monotonic() + patience_s, 0.2
         restarts_left = self._MAX_RESTARTS
         while True:
+            began = time.monotonic()
             try:
                 with self._open(method, path, body, more()) as answer:
                     return take(answer)
             except _Broken as error:
                 broken = error
-            if broken.midway and restarts_left:
+            # To send a large file may take all patience, before the server says that it is busy.
+            is_long = broken.pause_s is not None and time.monotonic() - began > patience_s / 2
+            if (broken.midway or is_long) and restarts_left:
                 deadline = time.monotonic() + self._timeout_s
                 restarts_left -= 1
             wait_s = max(pause_s, broken.pause_s or 0.0)

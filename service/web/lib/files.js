@@ -1,7 +1,7 @@
 /** Downloads: plain links, or by way of a blob where a key must go along. */
 
 import { address, isAbort, request } from "./api.js";
-import { h } from "./dom.js";
+import { fill, h } from "./dom.js";
 import { storedKey } from "./keys.js";
 import { problemPanel } from "./problem.js";
 
@@ -24,14 +24,37 @@ export function fileLink({ text, href: path, name, main = false, open = false })
     if (link.getAttribute("aria-busy")) return;
     link.setAttribute("aria-busy", "true");
     try {
-      save(await (await request(href)).blob(), name);
+      save(await whole(await request(href), (share) => fill(link, `${text}: ${Math.floor(100 * share)} %`)), name);
     } catch (error) {
       if (!isAbort(error)) link.after(problemPanel(error));
     } finally {
+      fill(link, text);
       link.removeAttribute("aria-busy");
     }
   } }, text);
   return link;
+}
+
+/**
+ * Return what an answer brings, telling how much of it is here: results may take minutes, and of
+ * what a page fetches itself browsers show nothing.
+ *
+ * @param {Response} answer
+ * @param {(share: number) => void} onProgress
+ * @returns {Promise<Blob>}
+ */
+function whole(answer, onProgress) {
+  const size = Number(answer.headers.get("Content-Length"));
+  if (!answer.body || !size) return answer.blob();
+  let come = 0;
+  const counted = answer.body.pipeThrough(new TransformStream({
+    transform(chunk, controller) {
+      come += chunk.length;
+      onProgress(Math.min(come / size, 1));
+      controller.enqueue(chunk);
+    },
+  }));
+  return new Response(counted, { headers: answer.headers }).blob();
 }
 
 /**

@@ -160,13 +160,14 @@ def job_document(**fields: Any) -> bytes:
     return json.dumps(example | fields).encode()
 
 
-def test_a_long_upload_that_breaks_off_is_sent_again(tmp_path: Path):
+@pytest.mark.parametrize("busy", [False, True])
+def test_a_long_upload_that_breaks_off_is_sent_again(tmp_path: Path, busy: bool):
     """Also where it took longer than the patience with a server that is away."""
     source = tmp_path / "part.gcode"
     source.write_bytes(BODY)
     job = json.loads(job_document(state="queued"))
     with (
-        breaking_server(job) as (address, keys),
+        breaking_server(job, busy=busy) as (address, keys),
         Client(address, patience_s=0.5 * TAKES_S) as client,
     ):
         assert client.submit(source, machine="ender3").id == job["id"]

@@ -145,6 +145,7 @@ def test_a_job_too_large_for_the_disk_is_told_so(
         job = until(lambda: (j := client.get(where).json())["state"] == "failed" and j, 60)
         assert job["error"]["title"] == "The job is larger than the disk"
         assert "60 MiB in all" in job["error"]["detail"]
+        assert "Limit the size of the result (max_mb)" in job["error"]["detail"]
         assert client.delete(where).status_code == 204
 
         # What would fit without a neighbour waits, says for how much, and holds nobody up.
