@@ -14,6 +14,7 @@ from stillpath.models.identification.excitation import (
     welch_kernel,
 )
 from stillpath.models.identification.modal_structure import ModalStructure
+from stillpath.models.identification.readers.table_range import first_band_hz, start_of_test
 from stillpath.models.identification.types import Excitation, Spectrum
 
 __all__ = [
@@ -153,7 +154,8 @@ def moved_most(spectrum: Spectrum) -> tuple[str, float]:
     (str, float)
         ("", 0.0) where the table does not part the sensor's axes.
     """
-    low = (spectrum.f_hz >= _PLATEAU_HZ[0]) & (spectrum.f_hz <= _PLATEAU_HZ[1])
+    low_hz, high_hz = first_band_hz(start_of_test(spectrum)[0])
+    low = (spectrum.f_hz >= low_hz) & (spectrum.f_hz <= high_hz)
     power = {n: float(np.nansum(spectrum.psd[n][low])) for n in "xyz" if n in spectrum.psd}
     total = sum(power.values())
     most = max(power, key=power.__getitem__, default="")

@@ -10,10 +10,14 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from stillpath.models.arrays import Array
 from stillpath.models.document import Document, NonNegative, Positive
 from stillpath.models.errors import ModelError
 from stillpath.models.friction import Guides
+from stillpath.models.identification.readers.table_range import (
+    end_of_test,
+    first_band_hz,
+    start_of_test,
+)
 from stillpath.models.identification.types import (
     AccelerationLog,
     Axis,
@@ -42,8 +46,6 @@ NO_TEST = (
 )
 """Note of an M956 log."""
 _NEW_TEST = date(2024, 12, 1)
-_TELLS_RANGE = date(2024, 2, 17)
-"""Since then a table ends at 1.5 max_freq (klippy/extras/resonance_tester.py), before at 200 Hz."""
 _PER_HZ = "accel_per_hz"
 _KLIPPER = {
     "accel_per_hz_mm_s": _PER_HZ,
@@ -55,18 +57,11 @@ _KLIPPER = {
 }
 """What users call them: options of [resonance_tester]."""
 _OLD = {"accel_per_hz_mm_s": 75.0, "f_end_hz": 10000.0 / 75.0, "sweeping_accel_mm_s2": 0.0}
-_LEAST_END_HZ, _END_DIFFERS_HZ = 40.0, 8.0
-_BESIDE_HZ, _FALL = 15.0, 100.0
-"""A test's third harmonic has 1/243 of the density of its fundamental; no resonance falls by 100
-within so few Hz."""
-_EARLY_HZ, _EARLY_FALL = 12.0, 20.0
-"""Up to 123 Hz the densities of 45 real tables fall by less, and those of 16 virtual tests to 133
-Hz; each of 48 that ended at 90, 100 or 120 Hz is found."""
 _BESIDE_SLOW_HZ, _SLOW_RATE_HZ, _LEAST_SLOW_S = 0.05, 20.0, 30.0
 _SLOW_MM_S2, _MOVED_MM_S2 = (60.0, 180.0), 500.0
 """Slow motion without and with the slow sweep, rms: its 400 mm/s^2 are 360 in the first harmonic.
 Below the last value in all, the sensor did not move with the test and tells nothing."""
-_SLOW_BAND_HZ, _ABOVE_HZ, _SLOW_IN_TABLE_MM_S2 = (1.0, 4.0), (8.0, 15.0), (110.0, 150.0)
+_SLOW_BAND_HZ, _SLOW_IN_TABLE_MM_S2 = (1.0, 4.0), (110.0, 150.0)
 _LEAST_SLOW = 0.5
 """The same in a table, where the window leaves 228 mm/s^2 of the slow sweep, 1.5 times the power of
 the test itself from 8 to 15 Hz. Without it up to 92 mm/s^2 and 0.21 times (45 real tables); more of
@@ -264,17 +259,21 @@ def _resolved(measurement: AccelerationLog | Spectrum, settings: ReadSettings) -
         )
     made = settings.firmware_date or date_in_name(measurement.source)
     defaults = Excitation(direction=direction_of(axis))
-    by_file = _contradicts(measurement, settings, made)
+    found: list[str] = []
+    start_hz = settings.f_start_hz
+    if isinstance(measurement, Spectrum) and start_hz is None:
+        start_hz, why = start_of_test(measurement)
+        found += why
+    by_file = _contradicts(measurement, settings, made, start_hz)
     old = _is_old(made) is not by_file
     given = {
         "accel_per_hz_mm_s": settings.accel_per_hz_mm_s,
-        "f_start_hz": settings.f_start_hz,
+        "f_start_hz": start_hz,
         "f_end_hz": settings.f_end_hz,
         "hz_per_s": settings.hz_per_s,
         "sweeping_accel_mm_s2": settings.sweeping_accel_mm_s2,
         "sweeping_period_s": settings.sweeping_period_s,
     }
-    found: list[str] = []
     written = measurement.accel_per_hz_mm_s if isinstance(measurement, Spectrum) else None
     if written is not None:
         # Kalico writes that of printer.cfg, also where the command gave another (2026-07).
@@ -282,7 +281,7 @@ def _resolved(measurement: AccelerationLog | Spectrum, settings: ReadSettings) -
         if stated != written:
             found.append(f"{_PER_HZ} {stated:g} was stated, {written:g} in the file does not count")
     if isinstance(measurement, Spectrum) and settings.f_end_hz is None:
-        given["f_end_hz"], why = _end_of_test(measurement, made, defaults.f_end_hz)
+        given["f_end_hz"], why = end_of_test(measurement, made, defaults.f_end_hz, start_hz)
         found += why
     usual_of_old = _OLD
     if old and settings.f_end_hz is None and _lasts_as_new(measurement, settings):
@@ -311,95 +310,21 @@ def _resolved(measurement: AccelerationLog | Spectrum, settings: ReadSettings) -
     return _Resolved(excitation, tuple(found))
 
 
-def _end_of_test(
-    spectrum: Spectrum, made: date | None, default_hz: float
-) -> tuple[float | None, tuple[str, ...]]:
-    """Return max_freq if the table tells that it is not the default, and a note that says so."""
-    tells_range = made is None or made >= _TELLS_RANGE
-    end_hz = _end_of_range(spectrum, default_hz) if tells_range else None
-    if end_hz is not None:
-        told = (
-            f"the table reaches {spectrum.f_hz[-1]:g} Hz, 1.5 max_freq: so max_freq is "
-            f"{end_hz:g}; give it if the table was cut"
-        )
-        return end_hz, (told,)
-    end_hz = _early_end(spectrum, default_hz)
-    if end_hz is None:
-        return None, ()
-    told = (
-        f"warning: the density falls at {end_hz:g} Hz as where a test ends, so max_freq is taken "
-        f"to be {end_hz:g}; give max_freq if it was another"
-    )
-    return end_hz, (told,)
-
-
-def _early_end(spectrum: Spectrum, default_hz: float) -> float | None:
-    """Return where a test ended long before the default, if the density shows it.
-
-    Tables of a Klipper before 2024-02, and of vendors' to this day, reach 200 Hz whatever max_freq
-    was. Taken for a resonance's flank, the end makes a mode beside it that the printer lacks.
-    """
-    f_hz = spectrum.f_hz
-    density = np.sum(list(spectrum.psd.values()), axis=0) / np.maximum(f_hz, 1.0) ** 2
-
-    def part(low_hz: float, high_hz: float) -> Array:
-        return np.asarray(density[(f_hz >= low_hz) & (f_hz <= high_hz)])
-
-    level, best = part(*_ABOVE_HZ), (0.0, 0.0)
-    for end in f_hz[(f_hz >= _LEAST_END_HZ) & (f_hz <= default_hz - _EARLY_HZ)]:
-        before, left = part(end - 6.0, end - 1.0), part(end - 20.0, end - 6.0)
-        beyond, floor = part(end + 3.0, default_hz - 5.0), part(end + 3.0, end + 12.0)
-        if min(map(len, (level, before, left, beyond, floor))) < 2 or not floor.min() > 0.0:
-            continue
-        # A resonance rises as steeply as it falls, its flank goes on falling, and above a zero an
-        # axis moves again; above the end of a test only harmonics are left.
-        is_edge = before.min() < 10.0 * np.median(left) and floor.max() < 6.0 * floor.min()
-        if is_edge and beyond.max() < 0.5 * np.median(level):
-            best = max(best, (float(before.min() / beyond.max()), float(end)))
-    fall, end_hz = best
-    if fall < _EARLY_FALL:
-        return None
-    whole = 5.0 * round(end_hz / 5.0)
-    return whole if abs(whole - end_hz) <= 2.0 else end_hz - 1.0
-
-
-def _end_of_range(spectrum: Spectrum, default_hz: float) -> float | None:
-    """Return max_freq if the table tells that it is not the default, nor that of before.
-
-    Since 2024-02 tables end at the last bin up to 1.5 max_freq.
-    """
-    bin_hz = float(spectrum.f_hz[-1] - spectrum.f_hz[-2])
-    least = float(spectrum.f_hz[-1]) / 1.5
-    if least < _LEAST_END_HZ or abs(least - default_hz) < _END_DIFFERS_HZ:
-        return None
-    if _falls(spectrum, default_hz):
-        return None
-    whole = 5.0 * math.ceil(least / 5.0 - 1e-9)
-    return whole if whole < least + bin_hz / 1.5 else least
-
-
-def _falls(spectrum: Spectrum, end_hz: float) -> bool:
-    """Return whether the density falls as at the end of a test, where only harmonics go on."""
-    density = np.sum(list(spectrum.psd.values()), axis=0)
-    away = spectrum.f_hz - end_hz
-    inside, outside = (away >= -_BESIDE_HZ) & (away <= 0.0), (away >= 5.0) & (away <= _BESIDE_HZ)
-    if not inside.any() or not outside.any():
-        return False
-    return bool(np.median(density[inside]) > _FALL * np.median(density[outside]))
-
-
 def _is_old(made: date | None) -> bool:
     return made is not None and made < _NEW_TEST
 
 
 def _contradicts(
-    measurement: AccelerationLog | Spectrum, settings: ReadSettings, made: date | None
+    measurement: AccelerationLog | Spectrum,
+    settings: ReadSettings,
+    made: date | None,
+    start_hz: float | None,
 ) -> bool:
     """Return whether a file shows another test than that of its day."""
     if settings.sweeping_accel_mm_s2 is not None:
         return False
     if isinstance(measurement, Spectrum):
-        return _table_sweeps(measurement) is _is_old(made)
+        return _table_sweeps(measurement, start_hz) is _is_old(made)
     period_s = settings.sweeping_period_s or Excitation((1.0, 0.0)).sweeping_period_s
     return _sweeps(measurement, period_s) is _is_old(made)
 
@@ -418,7 +343,7 @@ def _lasts_as_new(measurement: AccelerationLog | Spectrum, settings: ReadSetting
     return _LONGER_S[0] <= lasted_s - test_s <= _LONGER_S[1]
 
 
-def _table_sweeps(table: Spectrum) -> bool | None:
+def _table_sweeps(table: Spectrum, start_hz: float | None) -> bool | None:
     """Return whether a table shows the slow square wave of tests since 2024-12; None if unsure."""
     axes = [psd for name, psd in table.psd.items() if name in ("x", "y", "z")]
     densities = np.array([np.sum(axes, axis=0)] if axes else [*table.psd.values()])
@@ -433,7 +358,7 @@ def _table_sweeps(table: Spectrum) -> bool | None:
         return False
     slow = largest(_SLOW_BAND_HZ)
     least, most = np.square(_SLOW_IN_TABLE_MM_S2)
-    if slow >= most and slow >= _LEAST_SLOW * largest(_ABOVE_HZ):
+    if slow >= most and slow >= _LEAST_SLOW * largest(first_band_hz(start_hz)):
         return True
     moved = largest((0.0, math.inf)) >= _MOVED_MM_S2**2
     return False if slow <= least and moved else None

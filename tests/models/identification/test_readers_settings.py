@@ -21,6 +21,7 @@ from stillpath.models.identification.readers import (
     excitation_for,
     excitation_notes,
 )
+from stillpath.models.identification.spectrum_model import moved_most
 from stillpath.models.identification.synthetic import Sensor
 from stillpath.models.identification.types import Excitation, Spectrum
 from tests.models.identification.recordings import LEGACY, SWEEPING, quick_log
@@ -269,3 +270,50 @@ def test_date_in_name() -> None:
     assert date_in_name("0_2024-03-09_10.11.12.csv") == date(2024, 3, 9)
     assert date_in_name("raw_20249999_20240102.csv") == date(2024, 1, 2)
     assert date_in_name("raw_data_x_1.csv") is None
+
+
+@pytest.mark.parametrize(
+    ("test", "settings"),
+    [
+        (replace(OLD, f_start_hz=20.0, f_end_hz=120.0, accel_per_hz_mm_s=100.0), {}),
+        (replace(NEW, f_start_hz=20.0, f_end_hz=120.0, accel_per_hz_mm_s=100.0), {}),
+        (replace(NEW, f_start_hz=20.0), {}),
+        (replace(OLD, f_start_hz=20.0, f_end_hz=80.0, accel_per_hz_mm_s=300.0), {}),
+        (replace(OLD, f_start_hz=30.0, f_end_hz=90.0), {}),
+        (replace(OLD, f_start_hz=20.0), {"f_start_hz": 18.0}),
+    ],
+)
+def test_a_table_tells_that_its_test_began_late(
+    test: Excitation, settings: dict[str, float]
+) -> None:
+    """Creality's K2 has min_freq 20, FLSUN's S1 too: what was not shaken was taken to stand still,
+    and a machine had modes at 22, 26 and 36 Hz that the printer lacks."""
+    table = simulated_table(test, "resonances_x_a.csv")
+    ratio = table.f_hz / 45.0
+    gain = np.abs(1 / (1 - ratio**2 + 0.12j * ratio)) ** 2
+    noise = np.full(len(gain), 20.0)
+    rings = replace(table, psd={"x": table.psd["x"] * gain + noise, "z": noise})
+    given = ReadSettings.model_validate(settings)
+    for one in (table, rings):
+        told = excitation_for(one, given)
+        assert told.f_start_hz == settings.get("f_start_hz", test.f_start_hz)
+        assert told.f_end_hz == pytest.approx(test.f_end_hz, abs=1.7)
+        warned = any("min_freq is taken to be" in note for note in excitation_notes(one, given))
+        assert warned != bool(settings)
+    assert moved_most(rings)[0] == "x"
+    assert moved_most(rings)[1] > 0.99
+
+
+@pytest.mark.parametrize("test", [OLD, NEW, replace(NEW, accel_per_hz_mm_s=40.0)])
+@pytest.mark.parametrize("mode_hz", [16.0, 21.0, 26.0, 40.0, 70.0])
+@pytest.mark.parametrize("zero", [0.85, 0.95, None])
+def test_a_resonance_is_not_the_beginning_of_a_test(
+    test: Excitation, mode_hz: float, zero: float | None
+) -> None:
+    table = simulated_table(test, "resonances_x_a.csv")
+    ratio = table.f_hz / mode_hz
+    gain = 1 / (1 - ratio**2 + 0.06j * ratio)
+    if zero is not None:
+        gain *= 1 - (ratio / zero) ** 2 + 0.06j * ratio / zero
+    rings = replace(table, psd={"x": table.psd["x"] * np.abs(gain) ** 2 + 1.0})
+    assert excitation_for(rings).f_start_hz == 5.0
