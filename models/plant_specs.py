@@ -38,8 +38,8 @@ __all__ = [
 
 Damping = Annotated[float, Field(gt=0, le=10, allow_inf_nan=False)]
 SamplingTime = Annotated[float, Field(gt=1e-6, le=1.0, allow_inf_nan=False)]
-Complex = tuple[Finite, Finite]
-"""Real and imaginary part."""
+Root = tuple[Finite, Finite]
+"""Real and imaginary part of a zero or pole."""
 
 MOST_FRICTION_MM = 0.1
 """Guides that hold an axis back by more are to be mended, not compensated."""
@@ -217,8 +217,8 @@ class ZpkSpec(_Plant):
     """
 
     kind: Literal["zpk"] = "zpk"
-    zeros: tuple[Complex, ...] = ()
-    poles: Annotated[tuple[Complex, ...], Field(min_length=1, max_length=40)]
+    zeros: tuple[Root, ...] = ()
+    poles: Annotated[tuple[Root, ...], Field(min_length=1, max_length=40)]
     gain: Finite | None = None
     dt_s: SamplingTime | None = None
 
@@ -436,7 +436,7 @@ def _complex(*parts: NDArray[np.generic]) -> NDArray[np.complex128]:
     return np.concatenate([np.zeros(0, complex), *parts]).astype(complex)
 
 
-def _conjugate(listed: tuple[Complex, ...], what: str) -> NDArray[np.complex128]:
+def _conjugate(listed: tuple[Root, ...], what: str) -> NDArray[np.complex128]:
     """Return the listed roots, exactly closed under conjugation."""
     roots = np.array([complex(*r) for r in listed], dtype=complex)
     upper = roots[roots.imag > 0]

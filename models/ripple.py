@@ -47,7 +47,7 @@ RippleAxis = Literal["x", "y", "a", "b"]
 """X and Y, and the motors of CoreXY: a (x + y) and b (x - y)."""
 
 
-STEEPEST = 0.5
+_STEEPEST = 0.5
 """Largest slope |d delta / d s|: beyond 1 the motor would have to turn back to move on."""
 _LARGEST_UM = 5000.0
 
@@ -103,10 +103,10 @@ class AxisRipple(Document):
     @model_validator(mode="after")
     def _gentle(self) -> AxisRipple:
         slope = self.table("input").steepest
-        if slope > STEEPEST:
+        if slope > _STEEPEST:
             raise ValueError(
                 f"the input ripple has a slope of up to {slope:.2g} mm per mm, more than "
-                f"{STEEPEST}: check amplitude_um (micrometres) and pitch_mm (millimetres)"
+                f"{_STEEPEST}: check amplitude_um (micrometres) and pitch_mm (millimetres)"
             )
         largest_um = max(h.amplitude_um for source in self.sources for h in source.harmonics)
         if largest_um > _LARGEST_UM:

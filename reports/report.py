@@ -82,10 +82,19 @@ def render_report(result: Result) -> str:
 def headline_figures(
     channels: Sequence[Channel], where: str | float | None = None
 ) -> dict[str, Any]:
-    """Contour error rms while extruding, by channel, and how many times smaller it became.
+    """Return what the report says first: contour errors (rms, um) while extruding.
 
     Of a file that extrudes nothing, such as a coupon drawn with a pen, that of all motion; of one
     that is compensated in part, that of the features that were chosen (the setting `where`).
+
+    Returns
+    -------
+    dict
+        ``before``, ``after``, ``shaper`` : of the channels; None without such a channel.
+        ``ratio`` : how many times smaller the error became; None if it hardly did.
+        ``of`` : words for what these are errors of.
+        ``range``, ``shaper_range`` : of `after` and `shaper` over the plants, if they are known.
+        ``rubbing`` : upper ends of ranges with guides that rub much, by channel, if it is known.
     """
     extrudes = any(channel.extruding.contour_max_um > 0 for channel in channels)
     scope = "extruding" if extrudes else "all_motion"

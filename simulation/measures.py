@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from stillpath.models.arrays import Array, Mask
+from stillpath.models.arrays import Array, Ints, Mask
 from stillpath.simulation._contour_kernels import (
     ALL,
     BOX,
@@ -39,7 +39,6 @@ __all__ = [
     "tracking_error",
 ]
 
-Ints = NDArray[np.int32]
 
 WINDOW_S = 0.08
 """Time before and after a sample in which the nearest point of the path is searched."""
@@ -76,7 +75,7 @@ class GroupTally:
 
     channels: int
     lowest: int = 0
-    count: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    count: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     square_sum: Array = field(init=False)
     max: Array = field(init=False)
 
@@ -84,7 +83,7 @@ class GroupTally:
         self.square_sum = np.zeros((self.channels, 0))
         self.max = np.zeros((self.channels, 0))
 
-    def add(self, values: Array, groups: Ints, use: Mask) -> None:
+    def add(self, values: Array, groups: NDArray[np.int32], use: Mask) -> None:
         """Add the values, shape (channels, n), where `use` is true to their group."""
         if len(groups) == 0:
             return
@@ -139,7 +138,7 @@ class ContourErrors:
         return int(self.error_mm.shape[1])
 
     @property
-    def index(self) -> NDArray[np.int64]:
+    def index(self) -> Ints:
         """Sample numbers that the errors belong to."""
         return self.first + self.stride * np.arange(len(self), dtype=np.int64)
 
@@ -238,7 +237,7 @@ class ChosenMeter:
         self._points = np.zeros((channels, 2, 0))
         self._centres = np.zeros(0, np.int64)
 
-    def push(self, y_d_mm: Array, y_mm: Array, chosen: NDArray[np.int64]) -> Array:
+    def push(self, y_d_mm: Array, y_mm: Array, chosen: Ints) -> Array:
         """Add a block as `ContourMeter` has it, and which of its samples are to be measured.
 
         Returns the errors (channels, m) of the next chosen samples, as many as have their window.
@@ -397,7 +396,7 @@ class PathDistances:
         path_tables(self._path, *self._tables)
         self._window = round(window_s / dt_s)
 
-    def at(self, points_mm: Array, index: NDArray[np.int64]) -> Array:
+    def at(self, points_mm: Array, index: Ints) -> Array:
         """Return the errors of positions (2, m) at the samples `index`, rising."""
         out = np.empty(len(index))
         points = np.ascontiguousarray(points_mm)
@@ -405,7 +404,7 @@ class PathDistances:
         return out
 
 
-def _room_for_tables(path: Array) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+def _room_for_tables(path: Array) -> tuple[Ints, Ints, Array]:
     segments = max(path.shape[1] - 1, 0)
     first, last = np.empty((2, segments), np.int64)
     return first, last, np.empty((-(-segments // BOX), 4))

@@ -124,7 +124,7 @@ def align(
         for.
     """
     grid_s, accel = resample(log)
-    rate_hz = (len(grid_s) - 1) / float(grid_s[-1] - grid_s[0])
+    rate_hz = _rate_hz(grid_s)
     found = _find(log, excitation, grid_s, accel)
     profile, start_s, command = found.profile, found.start_s, found.command
     direction = found.vector / np.linalg.norm(found.vector)
@@ -201,7 +201,12 @@ def resample(log: AccelerationLog) -> tuple[Array, Array]:
     return grid_s, accel - np.median(accel, axis=0)
 
 
+def _rate_hz(grid_s: Array) -> float:
+    return (len(grid_s) - 1) / float(grid_s[-1] - grid_s[0])
+
+
 def _kinds(excitation: Excitation) -> tuple[Excitation, ...]:
+    """Return the tests it may be: without the slow square wave, that of before 2024-12 too."""
     if excitation.sweeping_accel_mm_s2 > 0.0 and excitation.sweeping_period_s > 0.0:
         return (excitation,)
     return tuple(replace(excitation, out_and_back=old) for old in (False, True))
@@ -210,7 +215,7 @@ def _kinds(excitation: Excitation) -> tuple[Excitation, ...]:
 def _find(log: AccelerationLog, excitation: Excitation, grid_s: Array, accel: Array) -> _Placed:
     """Return the test where it fits a log best, of the kind that fits best."""
     _check_axis(log, excitation)
-    rate_hz = (len(grid_s) - 1) / float(grid_s[-1] - grid_s[0])
+    rate_hz = _rate_hz(grid_s)
     low_hz = 1.2 * excitation.f_start_hz
     band_hz = (low_hz, min(low_hz + _BAND_HZ, excitation.f_end_hz))
     _check_length(log, grid_s, excitation, band_hz[1])
@@ -230,7 +235,7 @@ def _find(log: AccelerationLog, excitation: Excitation, grid_s: Array, accel: Ar
 def _place(
     excitation: Excitation, grid_s: Array, accel: Array, band_hz: tuple[float, float]
 ) -> _Placed:
-    rate_hz = (len(grid_s) - 1) / float(grid_s[-1] - grid_s[0])
+    rate_hz = _rate_hz(grid_s)
     profile = regenerate(excitation)
     start_s, other_s = _find_start(profile, excitation, grid_s, accel, band_hz)
     command = profile.cell_averages(grid_s - start_s, 1.0 / rate_hz)
@@ -395,7 +400,7 @@ def _check_first_frequency(
     first_hz = 0.5 * round(2.0 * (excitation.f_start_hz - excitation.hz_per_s * early_s))
     if early_s < _EARLIER_S or first_hz < _LEAST_FIRST_HZ:
         return
-    rate_hz = (len(grid_s) - 1) / float(grid_s[-1] - grid_s[0])
+    rate_hz = _rate_hz(grid_s)
     profile = regenerate(replace(excitation, f_start_hz=first_hz))
     before = grid_s < start_s
     command = profile.cell_averages(grid_s[before] - grid_s[0], 1.0 / rate_hz)

@@ -274,7 +274,7 @@ def _as_fit(data: ResponseData, found: _Candidate) -> Fit:
         delay_s=found.delay_s,
         band_hz=data.band_hz,
         modes=modes,
-        notes=(*data.notes, *band_warnings(modes, data.band_hz)),
+        warnings=(*data.warnings, *band_warnings(modes, data.band_hz)),
     )
 
 

@@ -299,5 +299,5 @@ def _as_fit(data: ResponseData, found: Modal) -> Fit:
         delay_s=found.delay_s,
         band_hz=data.band_hz,
         modes=modes,
-        notes=(*data.notes, *band_warnings(modes, data.band_hz)),
+        warnings=(*data.warnings, *band_warnings(modes, data.band_hz)),
     )

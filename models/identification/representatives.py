@@ -16,7 +16,7 @@ __all__ = ["Population", "mode_spread", "representatives"]
 
 P = TypeVar("P", bound=PlantSpec)
 
-MEMBERS = 16
+_MEMBERS = 16
 _F_HZ: Array = np.linspace(1.0, 150.0, 300)
 _PATH = _F_HZ**-2.0
 """Amplitude of a path with corners: its speed steps."""
@@ -98,7 +98,7 @@ def representatives(centres: Sequence[P], crowd: Sequence[P]) -> Population[P]:
     away = to_all[middle]
     usual = away <= np.quantile(away, _OUTLIERS)
     nearest = away.copy()
-    while len(members) < min(MEMBERS, len(crowd)):
+    while len(members) < min(_MEMBERS, len(crowd)):
         chosen = int(np.argmax(np.where(usual, nearest, -1.0)))
         if nearest[chosen] <= 0.0:
             break

@@ -44,7 +44,7 @@ class ResponseData:
     weight: Array
     noise: float
     delay_s: float
-    notes: tuple[str, ...]
+    warnings: tuple[str, ...]
 
     @property
     def unit_hz(self) -> float:
@@ -71,7 +71,7 @@ class ResponseData:
             self.weight[some],
             self.noise,
             self.delay_s,
-            self.notes,
+            self.warnings,
         )
 
 
@@ -97,9 +97,9 @@ def response_data(
             f"({int(unclear.sum())} have a coherence below {LEAST_COHERENCE}); check that the "
             "command belongs to this recording, or measure with more acceleration"
         )
-    notes = []
+    warnings = []
     if unclear.any():
-        notes.append(
+        warnings.append(
             f"{int(unclear.sum())} of {int(inside.sum())} frequencies left out (coherence below "
             f"{LEAST_COHERENCE}), {f[unclear].min():.1f} to {f[unclear].max():.1f} Hz"
         )
@@ -109,7 +109,7 @@ def response_data(
     start = h[: max(3, len(f) // 20)] * np.exp(2j * np.pi * f[: max(3, len(f) // 20)] * delay)
     if start.real.sum() < 0:
         h = -h
-        notes.append("the response had the opposite sign (sensor turned round); turned back")
+        warnings.append("the response had the opposite sign (sensor turned round); turned back")
     size, known = np.abs(h), np.isfinite(sd)
     noise = np.where(known, sd, min(_roughness(h), _UNKNOWN_NOISE) * size)
     floor = _RELATIVE_FLOOR * np.maximum(size, np.median(size[:9]))
@@ -117,7 +117,7 @@ def response_data(
     share = float(np.linalg.norm(weight * noise) / np.linalg.norm(weight * size))
     # Repeats also differ smoothly, as the machine drifts: a fit to their mean leaves none of that.
     share = min(share, max(_roughness(h), _LEAST_NOISE))
-    return ResponseData(f, h, np.asarray(weight, np.float64), share, delay, tuple(notes))
+    return ResponseData(f, h, np.asarray(weight, np.float64), share, delay, tuple(warnings))
 
 
 def coherent(coherence: Array) -> NDArray[np.bool_]:

@@ -18,7 +18,7 @@ from stillpath.models.errors import ModelError
 
 __all__ = ["Observability", "folded_distances", "observability", "refuse_unobservable"]
 
-LARGEST_NOISE_GAIN = 4.0
+_LARGEST_NOISE_GAIN = 4.0
 """Above, a harmonic is not observable: noise would count four times as much as for a wave alone."""
 
 
@@ -67,7 +67,7 @@ def observability(
     for k, (name, number) in enumerate(waves):
         gain = float(np.max(spread[2 * k : 2 * k + 2]))
         distance = None if farthest is None else float(farthest[k])
-        out.append(Observability(name, number, gain, distance, gain <= LARGEST_NOISE_GAIN))
+        out.append(Observability(name, number, gain, distance, gain <= _LARGEST_NOISE_GAIN))
     return tuple(out)
 
 
@@ -82,7 +82,7 @@ def refuse_unobservable(seen: Sequence[Observability]) -> None:
     )
     if named:
         raise ModelError(
-            f"not observable at the speeds driven: {named}; limit {LARGEST_NOISE_GAIN:g}. The "
+            f"not observable at the speeds driven: {named}; limit {_LARGEST_NOISE_GAIN:g}. The "
             "sensor cannot tell them apart: add a pass at another speed (f = h v / pitch), or "
             "learn fewer harmonics"
         )

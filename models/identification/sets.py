@@ -143,7 +143,7 @@ def response_set(
         fit=fit,
         measured=tuple(measured),
         member_fits=tuple(kept),
-        warnings=(*fit.notes, *_set_warnings(names, fits, kept, fit)),
+        warnings=(*fit.warnings, *_set_warnings(names, fits, kept, fit)),
     )
 
 
@@ -180,7 +180,7 @@ def spectrum_set(
     )
     plants = with_least_friction(plants, guides)
     return AxisIdentification(
-        axis=axis, plants=plants, fit=fit, measured=explanations.spectra, warnings=fit.notes
+        axis=axis, plants=plants, fit=fit, measured=explanations.spectra, warnings=fit.warnings
     )
 
 

@@ -129,7 +129,7 @@ class Explanations:
             trials=tuple(OrderTrial(n, db) for n, db in best.items()),
             magnitude_only=True,
             trust_below_hz=min(population.agree_below_hz(), search.model.band_hz[1]),
-            notes=(*self._warnings(gain), *left_out),
+            warnings=(*self._warnings(gain), *left_out),
         )
         return Explained(fit, population)
 

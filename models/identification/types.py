@@ -201,6 +201,8 @@ class Fit:
         Frequencies that were fitted.
     trust_below_hz : float, optional
         Above, the model may be far off although it fits.
+    warnings : tuple of str
+        What the user should look at.
     """
 
     spec: PlantSpec
@@ -212,7 +214,7 @@ class Fit:
     trials: tuple[OrderTrial, ...] = ()
     magnitude_only: bool = False
     trust_below_hz: float | None = None
-    notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
     @property
     def order(self) -> int:

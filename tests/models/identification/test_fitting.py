@@ -72,7 +72,7 @@ def test_modes_of_a_simulated_log(seed: int, gains: tuple[float, ...]) -> None:
     assert frequency_response(fit.spec, [0.0])[0] == pytest.approx(1.0, abs=1e-9)
     assert fit.spec.roots().poles.real.max() < 0
     # 170 Hz was not swept over.
-    assert any("outside the measured band" in note for note in fit.notes)
+    assert any("outside the measured band" in note for note in fit.warnings)
 
 
 def test_order_follows_what_the_noise_leaves_to_see() -> None:
@@ -138,7 +138,7 @@ def test_noise_only_in_incoherent_points_is_left_out() -> None:
     )
     fit = fit_response(spoilt)
     assert fit.modes[0].f_hz == pytest.approx(47.0, rel=1e-3)
-    assert any("29 of 258 frequencies left out" in note for note in fit.notes)
+    assert any("29 of 258 frequencies left out" in note for note in fit.warnings)
     with pytest.raises(ModelError, match="at least 12 are needed"):
         fit_response(replace(clean, coherence=np.full(len(clean.f_hz), 0.5)))
 
@@ -148,7 +148,7 @@ def test_sensor_turned_round() -> None:
     turned = fit_response(replace(clean, response=-clean.response))
     assert turned.modes[0].f_hz == pytest.approx(47.0, rel=1e-3)
     assert turned.gain == pytest.approx(0.97, rel=2e-3)
-    assert any("opposite sign" in note for note in turned.notes)
+    assert any("opposite sign" in note for note in turned.warnings)
 
 
 def test_band_and_unknown_deviation() -> None:

@@ -136,10 +136,10 @@ def test_most_plants_are_without_a_mode_that_may_be_the_frame_s() -> None:
     without = [min(m.f_hz for m in plant.modes) > 25.0 for plant in found.population.members]
     assert without[0]
     assert 0.6 < sum(w for w, free in zip(weights, without, strict=True) if free) < 0.95
-    (note,) = (text for text in found.fit.notes if "frame on its feet" in text)
+    (note,) = (text for text in found.fit.warnings if "frame on its feet" in text)
     assert re.search(r"\b1[34]\.\d Hz", note)
     firm = explaining.explained(frame_likely=0.0)
-    assert not any("frame on its feet" in text for text in firm.fit.notes)
+    assert not any("frame on its feet" in text for text in firm.fit.warnings)
     assert min(m.f_hz for m in firm.population.members[0].modes) == pytest.approx(14.0, rel=0.1)
 
 
@@ -166,7 +166,7 @@ def test_wrong_level_is_told() -> None:
     spectrum = simulated(NARROW, (0.7, 0.3), LEGACY)
     fit = explain_spectra([spectrum], replace(LEGACY, accel_per_hz_mm_s=120.0)).fit
     assert fit.gain == pytest.approx(0.625, rel=0.05)
-    assert any("implies accel_per_hz = 7" in n and "stated are 120" in n for n in fit.notes)
+    assert any("implies accel_per_hz = 7" in n and "stated are 120" in n for n in fit.warnings)
     # The shape does not depend on it.
     assert fit.modes[0].zeta == pytest.approx(0.015, rel=0.1)
 
@@ -180,7 +180,7 @@ def test_tables_of_a_machine_that_was_changed_between_them_are_told() -> None:
 
     def told(*spectra: Spectrum) -> list[str]:
         fit = explain_spectra(spectra, LEGACY).fit
-        return [note for note in fit.notes if "something was changed between them" in note]
+        return [note for note in fit.warnings if "something was changed between them" in note]
 
     assert told(first, again) == []
     (note,) = told(first, again, after)
@@ -227,9 +227,10 @@ def test_coupled_axes_are_told() -> None:
     coupled = replace(spectrum, psd={**spectrum.psd, "y": 0.3 * spectrum.psd["x"]})
     assert cross_axis_share(coupled, "x", (8.0, 130.0)) == (pytest.approx(0.3), "y")
     assert any(
-        "'y' has 30% of the power of 'x'" in n for n in explain_spectra([coupled], LEGACY).fit.notes
+        "'y' has 30% of the power of 'x'" in n
+        for n in explain_spectra([coupled], LEGACY).fit.warnings
     )
-    assert not any("power of" in n for n in narrow().explained().fit.notes)
+    assert not any("power of" in n for n in narrow().explained().fit.warnings)
 
 
 def test_dead_column_and_short_band_are_refused() -> None:
