@@ -315,9 +315,9 @@ def _notes(hatches: Hatches, wanted: Array, command: Array) -> tuple[str, ...]:
     if beyond_um[axis] > _LEAST_BEYOND * np.ptp(wanted, axis=1).max():
         notes.append(
             f"the command of {'XY'[axis]} goes {1e-3 * beyond_um[axis]:.3g} mm beyond the path, "
-            f"which is {1e-3 * np.ptp(wanted[axis]):.3g} mm long: where the machine cannot follow, "
-            "the prediction is void. A lower F, slower jumps (--jump-mm-s) and a low-pass "
-            "(--cutoff-hz) make it smaller"
+            f"which spans {1e-3 * np.ptp(wanted[axis]):.3g} mm: where the machine cannot follow, "
+            "the prediction is void. A lower F, slower jumps (--jump-mm-s) and a low-pass (of "
+            "zpetc, --cutoff-hz) make it smaller"
         )
     return tuple(notes)
 

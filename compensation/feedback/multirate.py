@@ -24,7 +24,6 @@ from stillpath.compensation.feedback.controller import (
     Prediction,
     Refusal,
     Uncertainty,
-    frequency_grid,
     judged,
 )
 from stillpath.compensation.feedback.repetitive import (
@@ -33,6 +32,7 @@ from stillpath.compensation.feedback.repetitive import (
     ServoInverse,
     internal_model,
     invert_servo,
+    notch_grid,
     observed_error,
     repetitive_blocks,
     repetitive_coefficients,
@@ -99,9 +99,8 @@ def design_multirate(
     upsampled = Block("up", error, every=rates.factor, zero_between=True)
     kept = Block("c", (("w", 1.0),), every=rates.factor)
     blocks = (*expected, upsampled, *repetitive_blocks(model, inverse, (("up", 1.0),), "w"), kept)
-    targets = np.arange(fundamental_hz, 0.5 / nominal.dt_s, fundamental_hz)
-    widths = np.full(len(targets), 0.05 * fundamental_hz)
-    f = frequency_grid(nominal.dt_s, targets.tolist(), widths.tolist())
+    # The notches at the fast rate have images at all multiples of the sampling rate over N.
+    f = notch_grid(nominal.dt_s, rates.period, fundamental_hz)
     factor = multirate_factor(nominal, model, inverse, rates.factor, f)
     design = Design(
         "rc-multirate",

@@ -59,6 +59,7 @@ __all__ = [
     "instant_margin",
     "internal_model",
     "invert_servo",
+    "notch_grid",
     "observed_error",
     "periodic_residual",
     "plug_in_factor",
@@ -389,6 +390,18 @@ def observed_error(
     return (expected,), (("ym", 1.0), ("expected", -1.0))
 
 
+def notch_grid(dt_s: float, period: int, fundamental_hz: float) -> Array:
+    """Return frequencies that are dense around the harmonics and around all notches of a memory.
+
+    The add-on is least robust beside a notch, and most of them may not lie on harmonics.
+    """
+    spacing_hz = 1.0 / (dt_s * period)
+    notches = spacing_hz * np.arange(1, (period + 1) // 2)
+    harmonics = np.arange(fundamental_hz, 0.5 / dt_s, fundamental_hz)
+    centres = [*notches.tolist(), *harmonics.tolist()]
+    return frequency_grid(dt_s, centres, [0.05 * spacing_hz] * len(centres))
+
+
 def instant_margin(loop: Loop, model: InternalModel, harmonics_hz: Sequence[float]) -> Extreme:
     """Return min 1/|T| in closed form: around a narrow notch T follows a circle.
 
@@ -444,9 +457,7 @@ def _designed(
     model = replace(model, mean_free=inverse.blocks_constants)
     expected, error = observed_error(nominal, compared)
     blocks = (*expected, *repetitive_blocks(model, inverse, error, "c"))
-    targets = np.arange(fundamental_hz, 0.5 / nominal.dt_s, fundamental_hz)[:64]
-    widths = np.full(len(targets), max(0.05 * fundamental_hz, 1.0))
-    f = frequency_grid(nominal.dt_s, targets.tolist(), widths.tolist())
+    f = notch_grid(nominal.dt_s, model.period, fundamental_hz)
     angle = 2 * np.pi * f * nominal.dt_s
     match = nominal.servo(f) * inverse.response(angle)
     factor = plug_in_factor(model.response(angle), match)

@@ -161,6 +161,19 @@ def test_references_are_left_alone_or_followed(kind: str) -> None:
     assert left["reference"] < 0.2 * left["response"]
 
 
+def test_the_least_margin_is_found_beside_every_notch() -> None:
+    """It lay at 1700.7 Hz, beside a notch of the divisor, and was told as 0.14 dB more."""
+    made = design_quasi((FAST,), 1100.0, alpha=0.9999)
+    inverse = invert_servo(FAST.servo_num, FAST.t0_den)
+    f = np.linspace(1650.0, 1750.0, 200_001)
+    w = angles(f, FAST.dt_s)
+    factor = plug_in_factor(
+        InternalModel(480, 0.9999).response(w), FAST.servo(f) * inverse.response(w)
+    )
+    least_db, _ = largest(FAST, factor, f)
+    assert made.prediction.min_inverse_t.db <= least_db + 0.005
+
+
 def test_multirate_beats_the_others_also_on_plants_that_differ() -> None:
     made = {
         "quasi": (design_quasi(LOOPS, 1200.0), 1),
