@@ -24,10 +24,17 @@ COPY integrations/slicers integrations/slicers
 RUN python -m pip wheel --no-deps --wheel-dir /dist . \
     && /opt/stillpath/bin/pip install --no-deps /dist/stillpath-*.whl
 COPY examples/ps_ender3_pauses_hept24f.gcode ./warm.gcode
+COPY examples/firmware firmware
 # The kernels are kept under the place where the modules lie: they are made in their final place.
 ENV NUMBA_CPU_NAME=generic NUMBA_CACHE_DIR=/opt/stillpath/numba PYTHONSAFEPATH=1
-RUN /opt/stillpath/bin/stillpath compensate warm.gcode -o /dist/warm.gcode --machine ender3 \
-    --report /dist/warm
+# Those of every firmware: what is missing here, each process of a container would compile anew.
+RUN export STILLPATH_DATA_DIR=/dist/data PATH=/opt/stillpath/bin:$PATH \
+    && stillpath machines set-firmware ender3 firmware/marlin.json --as marlin \
+    && stillpath machines set-firmware ender3 firmware/reprapfirmware.json --as reprapfirmware \
+    && for machine in ender3 marlin reprapfirmware; do \
+        stillpath compensate warm.gcode -o /dist/warm.gcode --machine $machine \
+            --report /dist/warm || exit 1; \
+    done
 
 FROM python:${PYTHON}-slim
 LABEL org.opencontainers.image.title="Stillpath" \

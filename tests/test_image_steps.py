@@ -109,6 +109,8 @@ def test_it_serves_without_the_sources_and_writes_only_data(image: Image):
     before = {path: path.stat().st_mtime_ns for path in installed.rglob("*") if path.is_file()}
     kernels = [path for path in before if path.suffix == ".nbc"]
     assert len(kernels) > 20, "no kernels were made in advance"
+    made_for = {path.parent.name.rsplit("_", 1)[0] for path in kernels}
+    assert made_for >= {"klipper", "marlin", "reprapfirmware"}
     for folder in (image.root / "context", image.root / "done-build"):
         if folder.exists():
             folder.rename(folder.with_name(f"{folder.name}-gone"))
