@@ -32,9 +32,12 @@ _CAPS = "max_velocity_silent"
 limits (elegooofficial/CentauriCarbon, firmware/core/klippy/toolhead.cpp, 2025-09)."""
 _LARGEST_BYTES = 4_000_000
 _MOST_FILES = 500
+_LONGEST_MACRO = 4000
 _SAVED_PREFIX = "#*# "
 _SECTION = re.compile(r"\[(?P<name>[^]]+)\]\s*$")
 _OPTION = re.compile(r"(?P<name>[^\s:=][^:=]*)[:=]\s*(?P<value>.*)$")
+_HALVES = re.compile(r"ACCEL_TO_DECEL=\{[^{}\n]*/\s*2(\.0*)?\s*\}")
+"""In M204 of QIDI's printers (QIDITECH, gcode_macro.cfg, 2023 to 2025)."""
 _COMMENT = re.compile(r"#.*$|(?:^|\s);.*$")
 
 
@@ -200,10 +203,12 @@ class _Reader:
             if not line:
                 continue
             if begun_at is not None and indent > begun_at:
-                # Numbers have one line, which may be the next; more of macros and lists is not
-                # needed.
-                if not current[begun].value:
+                # Numbers have one line, which may be the next; more of lists is not needed.
+                kept = current[begun].value
+                if not kept:
                     current[begun] = Option(line, number, file)
+                elif begun == "gcode" and len(kept) < _LONGEST_MACRO:
+                    current[begun] = current[begun]._replace(value=f"{kept}\n{line}")
                 continue
             begun_at = None
             if section := _SECTION.match(line):
@@ -394,9 +399,15 @@ def _arcs(config: PrinterConfig) -> list[Fact]:
 
 
 def _macros(config: PrinterConfig) -> list[Fact]:
-    """Macros that would otherwise be taken for words of another firmware."""
-    named = {section.partition("gcode_macro ")[2].strip().upper() for section in config.sections}
-    macros = sorted(named & FOREIGN.keys())
+    """Macros that would otherwise be taken for words of another firmware, or for Klipper's M204."""
+    named = {
+        section.partition("gcode_macro ")[2].strip().upper(): options
+        for section, options in config.sections.items()
+    }
+    macros = sorted(named.keys() & FOREIGN.keys())
+    body = named.get("M204", {}).get("gcode")
+    if body is not None and _HALVES.search(body.value):
+        macros = sorted([*macros, "M204"])
     if not macros and config.includes:
         return []
     return [Fact("gcode_macro", "", "firmware.macros", macros)]

@@ -531,6 +531,19 @@ def test_included_files_are_read_as_klipper_reads_them(store: MachineStore, tmp_
     assert "later.cfg line 3: [printer] max_velocity: 'fast' is no number" in one_line(capsys)
 
 
+@pytest.mark.parametrize(
+    ("line", "macros"),
+    [("ACCEL_TO_DECEL={s/2}", ("M204", "M900")), ("ACCEL_TO_DECEL={s}", ("M900",))],
+)
+def test_a_macro_m204_that_halves(store: MachineStore, config: Path, line: str, macros):
+    """As in QIDI's gcode_macro.cfg; Creality's passes M204 on."""
+    body = "{% set s = params.S|float %}\n\n    SET_VELOCITY_LIMIT ACCEL={s}"
+    macro = f"[gcode_macro M204]\nrename_existing: M99204\ngcode:\n    {body}\n"
+    config.write_text(f"{macro}    SET_VELOCITY_LIMIT {line}\n{CONFIG}")
+    assert machines("from-config", config, "--name", "mine") == 0
+    assert store.current("mine").machine.firmware.macros == macros
+
+
 def test_a_configuration_that_includes_itself(tmp_path: Path, capsys):
     file = tmp_path / "printer.cfg"
     file.write_text("[include a.cfg]\n")
