@@ -29,7 +29,8 @@ __all__ = [
 
 _CAPS = "max_velocity_silent"
 """An option of Elegoo's Centauri Carbon, where SET_VELOCITY_LIMIT and M204 stop at printer.cfg's
-limits (elegooofficial/CentauriCarbon, firmware/core/klippy/toolhead.cpp, 2025-09)."""
+limits, and M900 sets pressure advance (elegooofficial/CentauriCarbon, firmware/core/klippy/
+toolhead.cpp, kinematics/extruder.cpp, 2025-09)."""
 _LARGEST_BYTES = 4_000_000
 _MOST_FILES = 500
 _LONGEST_MACRO = 4000
@@ -256,6 +257,8 @@ def _printer(config: PrinterConfig) -> list[Fact]:
     else:
         ratio = config.number(section, option, ratio)
     planner, options = "firmware.planner", config.sections[section]
+    # Klippers that take this option are from before 2025-09, when these commands stop the head.
+    stopping = ["SET_PRESSURE_ADVANCE", *(["M900"] if _CAPS in options else [])]
     older = f"{planner}.max_accel_to_decel_mm_s2"
     return [
         Fact(section, "kinematics", "kinematics", config.text(section, "kinematics")),
@@ -263,6 +266,7 @@ def _printer(config: PrinterConfig) -> list[Fact]:
         Fact(section, "max_accel", f"{planner}.max_accel_mm_s2", accel),
         Fact(section, option, f"{planner}.minimum_cruise_ratio", ratio),
         *([Fact(section, option, older, to_decel)] if to_decel else []),
+        *([Fact(section, option, "firmware.stopping_macros", stopping)] if to_decel else []),
         *_numbers(
             config,
             section,

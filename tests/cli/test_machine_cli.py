@@ -375,6 +375,16 @@ def test_an_option_that_older_klippers_understand_otherwise(
     planner = machine.firmware.planner
     assert planner.max_accel_to_decel_mm_s2 == (1000.0 if told else None)
     assert differences(machine, read_printer_config(config)) == []
+    # Such a Klipper stops at each; users name others besides.
+    stops = ("SET_PRESSURE_ADVANCE",) if told else ()
+    assert machine.firmware.stopping_macros == stops
+    more_stops = machine.firmware.model_copy(update={"stopping_macros": ("_WAIT", *stops)})
+    machine = machine.model_copy(update={"firmware": more_stops})
+    assert differences(machine, read_printer_config(config)) == []
+    fewer = machine.firmware.model_copy(update={"stopping_macros": ()})
+    machine = machine.model_copy(update={"firmware": fewer})
+    found = differences(machine, read_printer_config(config))
+    assert [entry.place for entry in found] == ["firmware.stopping_macros"] * bool(told)
 
 
 def test_limits_by_axis_of_a_fork_are_told_apart(store: MachineStore, config: Path, capsys):
