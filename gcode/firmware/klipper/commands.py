@@ -75,14 +75,15 @@ def perhaps_macro(state: MachineState, command: Command) -> int:
 
     Creality's M205 sets the corner velocity, their M900 pressure advance, and the M300 of Klipper's
     own examples waits (CrealityOfficial/K1_Series_Klipper, config/*/gcode_macro.cfg, 2024;
-    Klipper3d/klipper, config/printer-sunlu-t3-2022.cfg, 2026-08).
+    Klipper3d/klipper, config/printer-sunlu-t3-2022.cfg, 2026-08). Anycubic's and Elegoo's Klippers
+    have M900 as a command (ANYCUBIC-3D/Kobra3, elegooofficial/CentauriCarbon, 2025).
     """
     if state.i[at.I_KNOWN] & 3 == 3 and state.firmware.unknown_commands != "skip":
         state.warn(
             f"{command.name} in the middle of the print: Klipper passes over it, but if yours has "
-            "a macro of that name, as many makers' printers have, it sets limits or waits in the "
-            f"middle of a stream; put {command.name} among the machine's macros (firmware section) "
-            "if there is one, or else among harmless_macros"
+            "a macro or a command of that name, as many makers' printers have, it sets limits or "
+            f"waits in the middle of a stream; put {command.name} among the machine's macros "
+            "(firmware section) if it has one, or else among harmless_macros"
         )
     return state.event(EventKind.HARMLESS)
 
