@@ -29,12 +29,16 @@ __all__ = [
 
 _CAPS = "max_velocity_silent"
 """An option of Elegoo's Centauri Carbon, where SET_VELOCITY_LIMIT and M204 stop at printer.cfg's
-limits (elegooofficial/CentauriCarbon, firmware/core/klippy/toolhead.cpp, 2025-09)."""
+limits, and M900 sets pressure advance (elegooofficial/CentauriCarbon, firmware/core/klippy/
+toolhead.cpp, kinematics/extruder.cpp, 2025-09)."""
 _LARGEST_BYTES = 4_000_000
 _MOST_FILES = 500
+_LONGEST_MACRO = 4000
 _SAVED_PREFIX = "#*# "
 _SECTION = re.compile(r"\[(?P<name>[^]]+)\]\s*$")
 _OPTION = re.compile(r"(?P<name>[^\s:=][^:=]*)[:=]\s*(?P<value>.*)$")
+_HALVES = re.compile(r"ACCEL_TO_DECEL=\{[^{}\n]*/\s*2(\.0*)?\s*\}")
+"""In M204 of QIDI's printers (QIDITECH, gcode_macro.cfg, 2023 to 2025)."""
 _COMMENT = re.compile(r"#.*$|(?:^|\s);.*$")
 
 
@@ -200,10 +204,12 @@ class _Reader:
             if not line:
                 continue
             if begun_at is not None and indent > begun_at:
-                # Numbers have one line, which may be the next; more of macros and lists is not
-                # needed.
-                if not current[begun].value:
+                # Numbers have one line, which may be the next; more of lists is not needed.
+                kept = current[begun].value
+                if not kept:
                     current[begun] = Option(line, number, file)
+                elif begun == "gcode" and len(kept) < _LONGEST_MACRO:
+                    current[begun] = current[begun]._replace(value=f"{kept}\n{line}")
                 continue
             begun_at = None
             if section := _SECTION.match(line):
@@ -251,6 +257,8 @@ def _printer(config: PrinterConfig) -> list[Fact]:
     else:
         ratio = config.number(section, option, ratio)
     planner, options = "firmware.planner", config.sections[section]
+    # Klippers that take this option are from before 2025-09, when these commands stop the head.
+    stopping = ["SET_PRESSURE_ADVANCE", *(["M900"] if _CAPS in options else [])]
     older = f"{planner}.max_accel_to_decel_mm_s2"
     return [
         Fact(section, "kinematics", "kinematics", config.text(section, "kinematics")),
@@ -258,6 +266,7 @@ def _printer(config: PrinterConfig) -> list[Fact]:
         Fact(section, "max_accel", f"{planner}.max_accel_mm_s2", accel),
         Fact(section, option, f"{planner}.minimum_cruise_ratio", ratio),
         *([Fact(section, option, older, to_decel)] if to_decel else []),
+        *([Fact(section, option, "firmware.stopping_macros", stopping)] if to_decel else []),
         *_numbers(
             config,
             section,
@@ -394,9 +403,15 @@ def _arcs(config: PrinterConfig) -> list[Fact]:
 
 
 def _macros(config: PrinterConfig) -> list[Fact]:
-    """Macros that would otherwise be taken for words of another firmware."""
-    named = {section.partition("gcode_macro ")[2].strip().upper() for section in config.sections}
-    macros = sorted(named & FOREIGN.keys())
+    """Macros that would otherwise be taken for words of another firmware, or for Klipper's M204."""
+    named = {
+        section.partition("gcode_macro ")[2].strip().upper(): options
+        for section, options in config.sections.items()
+    }
+    macros = sorted(named.keys() & FOREIGN.keys())
+    body = named.get("M204", {}).get("gcode")
+    if body is not None and _HALVES.search(body.value):
+        macros = sorted([*macros, "M204"])
     if not macros and config.includes:
         return []
     return [Fact("gcode_macro", "", "firmware.macros", macros)]

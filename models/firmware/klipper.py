@@ -100,7 +100,8 @@ class Klipper(FirmwareFacts):
     """None: unknown. It is switched off for our moves and stays off, and the report says so."""
     macros: tuple[str, ...] = ()
     """Configured macros with the name of another firmware's word, such as M205 or M900: they may do
-    anything. M205 also sets the corner velocity."""
+    anything. M205 also sets the corner velocity; M204 is named where it sets ACCEL_TO_DECEL to
+    half of its acceleration, too, as QIDI's does."""
 
     limits_capped: bool = False
     """SET_VELOCITY_LIMIT and M204 set no speed and no acceleration above those of `planner`, as on

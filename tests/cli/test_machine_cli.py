@@ -375,6 +375,16 @@ def test_an_option_that_older_klippers_understand_otherwise(
     planner = machine.firmware.planner
     assert planner.max_accel_to_decel_mm_s2 == (1000.0 if told else None)
     assert differences(machine, read_printer_config(config)) == []
+    # Such a Klipper stops at each; users name others besides.
+    stops = ("SET_PRESSURE_ADVANCE",) if told else ()
+    assert machine.firmware.stopping_macros == stops
+    more_stops = machine.firmware.model_copy(update={"stopping_macros": ("_WAIT", *stops)})
+    machine = machine.model_copy(update={"firmware": more_stops})
+    assert differences(machine, read_printer_config(config)) == []
+    fewer = machine.firmware.model_copy(update={"stopping_macros": ()})
+    machine = machine.model_copy(update={"firmware": fewer})
+    found = differences(machine, read_printer_config(config))
+    assert [entry.place for entry in found] == ["firmware.stopping_macros"] * bool(told)
 
 
 @pytest.mark.parametrize("height_mm", [0.0, 0.4])
@@ -541,6 +551,19 @@ def test_included_files_are_read_as_klipper_reads_them(store: MachineStore, tmp_
     (folder / "later.cfg").write_text("\n[printer]\nmax_velocity: fast\n")
     assert machines("check", "mine", "--printer-cfg", config) == 2
     assert "later.cfg line 3: [printer] max_velocity: 'fast' is no number" in one_line(capsys)
+
+
+@pytest.mark.parametrize(
+    ("line", "macros"),
+    [("ACCEL_TO_DECEL={s/2}", ("M204", "M900")), ("ACCEL_TO_DECEL={s}", ("M900",))],
+)
+def test_a_macro_m204_that_halves(store: MachineStore, config: Path, line: str, macros):
+    """As in QIDI's gcode_macro.cfg; Creality's passes M204 on."""
+    body = "{% set s = params.S|float %}\n\n    SET_VELOCITY_LIMIT ACCEL={s}"
+    macro = f"[gcode_macro M204]\nrename_existing: M99204\ngcode:\n    {body}\n"
+    config.write_text(f"{macro}    SET_VELOCITY_LIMIT {line}\n{CONFIG}")
+    assert machines("from-config", config, "--name", "mine") == 0
+    assert store.current("mine").machine.firmware.macros == macros
 
 
 def test_a_configuration_that_includes_itself(tmp_path: Path, capsys):

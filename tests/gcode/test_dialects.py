@@ -745,6 +745,20 @@ def test_a_macro_m205_sets_the_corner_velocity(read, line: str, corner_mm_s: flo
     assert block.events.kind.tolist() == [EventKind.UNKNOWN]
 
 
+def test_a_macro_m204_halves_what_short_moves_may_have(read) -> None:
+    """QIDI's sets ACCEL_TO_DECEL too, which newer Klippers do not have."""
+    older = PlannerLimits(max_accel_to_decel_mm_s2=9000.0)
+    for planner, macros, to_decel in (
+        (older, ("M204",), 1000.0),
+        (older, (), 9000.0),
+        (PlannerLimits(), ("M204",), 0.0),
+    ):
+        block, _ = read("M204 S2000\n", "klipper", planner=planner, macros=macros)
+        after = block.limits[block.events.limits_id[-1]]
+        assert (after.accel_mm_s2, after.accel_to_decel_mm_s2) == (2000.0, to_decel)
+        assert block.events.kind.tolist() == [EventKind.LIMITS]
+
+
 def test_a_limit_of_older_klippers_is_told_once(read) -> None:
     line = "SET_VELOCITY_LIMIT ACCEL=2000 ACCEL_TO_DECEL=1000"
     _, interpreter = read(f"G1 X5 F600\n{line}\n{line} ; again\n", "klipper")

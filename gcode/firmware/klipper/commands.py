@@ -50,8 +50,7 @@ _MOST_STATES = 1000
 def velocity_limit(state: MachineState, command: Command, *, capped: bool = False) -> int:
     """SET_VELOCITY_LIMIT; `capped`: up to the speed and acceleration of printer.cfg."""
     given = state.extended(command)
-    # Before 2024-03 there was ACCEL_TO_DECEL and no ratio (klippy/toolhead.py).
-    old = dict(zip(state.limits_names, state.initial_limits, strict=True))["accel_to_decel_mm_s2"]
+    old = _is_older(state)
     passed_over = "MINIMUM_CRUISE_RATIO" if old else "ACCEL_TO_DECEL"
     values = {}
     for key, (field, allows, allowed) in _LIMITS.items():
@@ -76,14 +75,15 @@ def perhaps_macro(state: MachineState, command: Command) -> int:
 
     Creality's M205 sets the corner velocity, their M900 pressure advance, and the M300 of Klipper's
     own examples waits (CrealityOfficial/K1_Series_Klipper, config/*/gcode_macro.cfg, 2024;
-    Klipper3d/klipper, config/printer-sunlu-t3-2022.cfg, 2026-08).
+    Klipper3d/klipper, config/printer-sunlu-t3-2022.cfg, 2026-08). Anycubic's and Elegoo's Klippers
+    have M900 as a command (ANYCUBIC-3D/Kobra3, elegooofficial/CentauriCarbon, 2025).
     """
     if state.i[at.I_KNOWN] & 3 == 3 and state.firmware.unknown_commands != "skip":
         state.warn(
             f"{command.name} in the middle of the print: Klipper passes over it, but if yours has "
-            "a macro of that name, as many makers' printers have, it sets limits or waits in the "
-            f"middle of a stream; put {command.name} among the machine's macros (firmware section) "
-            "if there is one, or else among harmless_macros"
+            "a macro or a command of that name, as many makers' printers have, it sets limits or "
+            f"waits in the middle of a stream; put {command.name} among the machine's macros "
+            "(firmware section) if it has one, or else among harmless_macros"
         )
     return state.event(EventKind.HARMLESS)
 
@@ -112,8 +112,13 @@ def reset_velocity_limit(state: MachineState, _command: Command) -> int:
     return state.event(EventKind.UNKNOWN)
 
 
-def acceleration(state: MachineState, command: Command, *, capped: bool = False) -> int:
-    """M204: S, or else the smaller of P and T; P or T alone are passed over."""
+def acceleration(
+    state: MachineState, command: Command, *, capped: bool = False, halved: bool = False
+) -> int:
+    """M204: S, or else the smaller of P and T; P or T alone are passed over.
+
+    `halved`: a macro, which sets half of it for ACCEL_TO_DECEL too.
+    """
     given = state.numbers(command, "SPT")
     accel = given.get("S")
     if accel is None and "P" in given and "T" in given:
@@ -123,6 +128,8 @@ def acceleration(state: MachineState, command: Command, *, capped: bool = False)
     if not at.MIN_VALUE <= accel <= at.MAX_VALUE:
         raise state.problem(f"the value {accel:g} is out of range; it must be above 0", command)
     values = {"accel_mm_s2": accel}
+    if halved and _is_older(state):
+        values["accel_to_decel_mm_s2"] = 0.5 * accel
     return state.set_limits(command, _held(state, values) if capped else values)
 
 
@@ -256,6 +263,12 @@ def activate_extruder(state: MachineState, command: Command) -> int:
     f[at.F_BASE + 3] = f[at.F_LAST + 3]
     state.note_modal()
     return state.event(EventKind.UNKNOWN)
+
+
+def _is_older(state: MachineState) -> bool:
+    """Tell whether there is ACCEL_TO_DECEL, and no ratio: before 2024-03 (klippy/toolhead.py)."""
+    limits = dict(zip(state.limits_names, state.initial_limits, strict=True))
+    return bool(limits["accel_to_decel_mm_s2"])
 
 
 def _held(state: MachineState, values: Mapping[str, float]) -> dict[str, float]:

@@ -53,7 +53,6 @@ ARC_WORDS: dict[str, Word] = {
 
 PYTHON_WORDS: dict[str, Word] = {
     "G28": home,
-    "M204": commands.acceleration,
     "M486": cancel_object,
     "T": commands.tool,
     "@": host_command,
@@ -71,7 +70,6 @@ PYTHON_WORDS: dict[str, Word] = {
 }
 
 CAPPED_WORDS: dict[str, Word] = {
-    "M204": partial(commands.acceleration, capped=True),
     "SET_VELOCITY_LIMIT": partial(commands.velocity_limit, capped=True),
 }
 
@@ -148,6 +146,10 @@ def klipper(firmware: Klipper) -> Dialect:
         Names its macros and says what an unknown name does.
     """
     skipped = firmware.unknown_commands == "skip"
+    macros = {name.upper() for name in firmware.macros}
+    acceleration = partial(
+        commands.acceleration, capped=firmware.limits_capped, halved="M204" in macros
+    )
 
     def otherwise(name: str) -> EventKind:
         # A name that no macro can have is passed over with a message.
@@ -158,13 +160,14 @@ def klipper(firmware: Klipper) -> Dialect:
         **({} if firmware.arcs else NO_ARCS),
         **({} if firmware.retraction else NO_RETRACTION),
         **FOREIGN,
-        **{name.upper(): MACROS.get(name.upper(), EventKind.UNKNOWN) for name in firmware.macros},
+        **{name: MACROS.get(name, EventKind.UNKNOWN) for name in sorted(macros)},
         **NATIVE,
         **{name.upper(): EventKind.STOP for name in firmware.stopping_macros},
         **{name.upper(): EventKind.HARMLESS for name in firmware.harmless_macros},
         **KERNEL_WORDS,
         **(ARC_WORDS if firmware.arcs else {}),
         **PYTHON_WORDS,
+        "M204": acceleration,
         **(CAPPED_WORDS if firmware.limits_capped else {}),
         **(RETRACTION_WORDS if firmware.retraction else {}),
     }
