@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import numpy as np
 
@@ -27,7 +28,7 @@ GAINS_TEXT = (
 )
 _GAINS_HEADERS = ("freq,psd_x,psd_y,psd_z,psd_xyz,mzv", "X_gain Y_gain Z_gain")
 _MOST_TERMINAL_LINES = 10_000
-_PER_HZ = "accel_per_hz"
+_PER_HZ, _SHAPERS = "accel_per_hz", "shapers:"
 _SHAPER = re.compile(r"\w+\([\d./]+\)|(smooth_)?(zvd?|mzv|ei|[23]hump_ei|zvd_ei|si)")
 _MIN_FREQ_HZ = 5.0
 """MIN_FREQ of klippy/extras/shaper_calibrate.py."""
@@ -63,6 +64,7 @@ def read_spectrum(table: Table, axis: str | None, settings: ReadSettings) -> Spe
     ModelError
         If there is no density, one is negative, or the tested axis has none.
     """
+    table = _with_shapers_counted(table)
     names, shapers = _densities(table)
     check_long(table, _LEAST_BINS, "frequencies", MOST_BINS)
     has_per_hz = _PER_HZ in table.names
@@ -93,12 +95,25 @@ def read_spectrum(table: Table, axis: str | None, settings: ReadSettings) -> Spe
     )
 
 
+def _with_shapers_counted(table: Table) -> Table:
+    """Return the table with as many columns of shapers as its rows have.
+
+    Klipper does not quote the commas in names such as mzv(n=6,t=1.0) (shaper_calibrate.py since
+    2026-04).
+    """
+    if _SHAPERS not in table.names or not table.rows:
+        return table
+    at = table.names.index(_SHAPERS) + 1
+    count = max(0, len(table.split(table.rows[0])) - at)
+    return replace(table, names=(*table.names[:at], *table.names[at:][:count]))
+
+
 def _densities(table: Table) -> tuple[list[str], list[str]]:
     """Return the names of the densities' columns, and of the shapers' columns."""
     names = list(table.names[1:])
     shapers: list[str] = []
-    if "shapers:" in names:
-        at = names.index("shapers:")
+    if _SHAPERS in names:
+        at = names.index(_SHAPERS)
         names, shapers = names[:at], names[at:]
     shapers += [n for n in names if _SHAPER.fullmatch(n)]
     names = [n for n in names if n != _PER_HZ and not _SHAPER.fullmatch(n)]

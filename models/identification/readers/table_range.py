@@ -15,13 +15,16 @@ __all__ = ["end_of_test", "first_band_hz", "start_of_test"]
 
 _TELLS_RANGE = date(2024, 2, 17)
 """Since then a table ends at 1.5 max_freq (klippy/extras/resonance_tester.py), before at 200 Hz."""
-_USUAL_START_HZ, _ABOVE_USUAL_HZ, _FIRST_HZ, _BAND_HZ = 5.0, 5.5, 8.0, 7.0
-_STARTS_HZ, _RISE = (14.0, 60.0), 40.0
-"""Where a test from 20 Hz begins, the density over f^2 rises by 600; within the same few Hz below a
-resonance by 4 (45 real tables), between a frame's antiresonance and resonance by less than 40 (180
-virtual ones)."""
+_USUAL_START_HZ, _FIRST_HZ, _BAND_HZ = 5.0, 8.0, 7.0
+_LOWEST_HZ, _BESIDE_SLOW_HZ, _HIGHEST_HZ, _RISE = (3.0, 8.0), (5.5, 14.0), 60.0, 80.0
+"""Frequencies: the lowest that are compared, and the lowest beginning that is looked for, without
+and with a slow sweep. The density over f^2 rises by 600 where a vendor's test begins, at 10 or 20
+Hz; within the same few Hz towards a resonance by 4 (45 real tables), and between a heavy frame's
+antiresonance and modes above by up to 50 (400 virtual ones)."""
 _SLOW_HZ, _SLOW_SHARES = (2.0, 4.0), (1.3, 0.85)
-"""Where the slow sweep tells its corners, and how well: what is more, and less, than they."""
+_SLOW_CORNER = 1e4
+"""Where the slow sweep tells its corners ((mm/s^2)^2 Hz, 60 000 for 400 mm/s^2; without it below
+2000), and how well: what is more, and less, than they."""
 _LEAST_END_HZ, _END_DIFFERS_HZ = 40.0, 8.0
 _BESIDE_HZ, _FALL = 15.0, 100.0
 """A test's third harmonic has 1/243 of the density of its fundamental; no resonance falls by 100
@@ -39,11 +42,16 @@ def start_of_test(spectrum: Spectrum) -> tuple[float | None, tuple[str, ...]]:
     f_hz, density = spectrum.f_hz, _density(spectrum)
     # The corners of the slow sweep have a density of 1/f^2.
     slow, squared = _within(f_hz, _SLOW_HZ), np.maximum(f_hz, 1.0) ** 2
-    corners = np.max(density[slow] * squared[slow], initial=0.0) / squared
-    least, most = (np.maximum(density - one * corners, 0.0) / squared for one in _SLOW_SHARES)
+    corner = float(np.max(density[slow] * squared[slow], initial=0.0))
+    below_hz, first_hz = _BESIDE_SLOW_HZ if corner > _SLOW_CORNER else _LOWEST_HZ
+    # Not over f^2 throughout: below the test there is noise, which has no slope.
+    scale = np.maximum(squared, _FIRST_HZ**2)
+    least, most = (
+        np.maximum(density - share * corner / squared, 0.0) / scale for share in _SLOW_SHARES
+    )
     full, start_hz = 0.0, None
-    for edge_hz in f_hz[_within(f_hz, _STARTS_HZ)]:
-        below = most[_within(f_hz, (_ABOVE_USUAL_HZ, edge_hz - 3.0))]
+    for edge_hz in f_hz[_within(f_hz, (first_hz, _HIGHEST_HZ))]:
+        below = most[_within(f_hz, (below_hz, edge_hz - 3.0))]
         above = least[_within(f_hz, (edge_hz + 1.5, edge_hz + 7.0))]
         if len(below) < 2 or len(above) < 2:
             continue

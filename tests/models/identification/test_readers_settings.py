@@ -280,14 +280,15 @@ def test_date_in_name() -> None:
         (replace(NEW, f_start_hz=20.0), {}),
         (replace(OLD, f_start_hz=20.0, f_end_hz=80.0, accel_per_hz_mm_s=300.0), {}),
         (replace(OLD, f_start_hz=30.0, f_end_hz=90.0), {}),
+        (replace(OLD, f_start_hz=10.0, f_end_hz=100.0, accel_per_hz_mm_s=150.0), {}),
         (replace(OLD, f_start_hz=20.0), {"f_start_hz": 18.0}),
     ],
 )
 def test_a_table_tells_that_its_test_began_late(
     test: Excitation, settings: dict[str, float]
 ) -> None:
-    """Creality's K2 has min_freq 20, FLSUN's S1 too: what was not shaken was taken to stand still,
-    and a machine had modes at 22, 26 and 36 Hz that the printer lacks."""
+    """Creality's K2 and FLSUN's S1 have min_freq 20, Anycubic's Kobra 3 has 10: what was not
+    shaken was taken to stand still, and a machine had modes at 22, 26 and 36 Hz."""
     table = simulated_table(test, "resonances_x_a.csv")
     ratio = table.f_hz / 45.0
     gain = np.abs(1 / (1 - ratio**2 + 0.12j * ratio)) ** 2

@@ -143,6 +143,19 @@ def test_data_sets_with_shapers() -> None:
     np.testing.assert_allclose(spectrum.psd["b"][-50:], PSD[1, -50:], rtol=3e-3)
 
 
+def test_commas_in_names_of_shapers() -> None:
+    """As of calibrate_shaper.py --shapers='ei,mzv(n=6,t=1.0)': a line had too few fields."""
+    header = "freq,psd_x,psd_y,psd_z,psd_xyz,shapers:,ei(52.0),mzv(n=6,t=1.0)(48.2)"
+    written = PSD * low(F_HZ) / (F_HZ + 0.1)
+    spectrum = read(table(header, written, "", "0.1", "0.2"), "x.csv")
+    assert list(spectrum.psd) == ["x", "y", "z", "xyz"]
+    np.testing.assert_allclose(spectrum.psd["x"][-50:], PSD[0, -50:], rtol=3e-3)
+    lines = table(header, written, "", "0.1", "0.2").split("\n")
+    short = "\n".join([*lines[:2], lines[2].rpartition(",")[0], *lines[3:]])
+    with pytest.raises(ModelError, match=r"line 3: 7 fields where 8 are expected"):
+        read(short)
+
+
 def interpolated(
     psd: np.ndarray, bins_hz: np.ndarray, end_hz: float = 202.5, more: str = ""
 ) -> str:
