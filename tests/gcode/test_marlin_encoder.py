@@ -51,7 +51,7 @@ def with_firmware(firmware: Marlin = FIRMWARE) -> Machine:
 def thinned(x: list[int], end_s: list[float], **options: Any) -> list[bool]:
     n = len(x)
     steps = np.column_stack((x, np.zeros(n), np.zeros(n))).astype(np.int64)
-    given = {"least": 6, "rate": 1e6, "burst": 8.0, "corexy": False, **options}
+    given = {"least": 6, "room": np.zeros(n), "rate": 1e6, "burst": 8.0, "corexy": False, **options}
     keep = np.zeros(n, np.bool_)
     begin, group = np.zeros((1, 3), np.int64), np.zeros(n, np.int64)
     thin(steps, begin, np.array(end_s), np.zeros(1), group, *given.values(), keep)
@@ -70,6 +70,14 @@ def test_no_more_segments_than_come_in() -> None:
     times = [0.001 * k for k in range(1, 13)]
     keep = thinned([10 * k for k in range(1, 13)], times, least=1, rate=250.1, burst=2.0)
     assert np.flatnonzero(keep).tolist() == [0, 1, 4, 8, 11]
+
+
+def test_fast_moves_are_long_enough_to_stop_within_the_queue() -> None:
+    times = [0.001 * k for k in range(1, 13)]
+    room = np.repeat([0.0, 25.0, 0.0], 4)
+    keep = thinned([10 * k for k in range(1, 13)], times, room=room)
+    # The sixth is only 20 steps from the fourth.
+    assert np.flatnonzero(keep).tolist() == [0, 1, 2, 3, 6, 8, 9, 10, 11]
 
 
 def test_a_turn_straight_back_gets_a_step_to_the_side() -> None:
@@ -105,7 +113,7 @@ def test_rates_reach_the_ends_in_time(seed: int, per_mm: float, first_steps: flo
     feedrate, predicted = np.zeros(n), np.zeros(n)
     ours, fastest, none = np.ones(n, np.bool_), np.full(n, 500.0), np.zeros(n)
     blocks = Blocks(ours, steps, steps / per_mm, np.cumsum(planned_s), planned_s, fastest, none)
-    assign_rates(blocks, none, none, first_steps, 2e6, 0.0, 120.0, 0.0, feedrate, predicted)
+    assign_rates(blocks, none, none, first_steps, 2e6, 0.0, 120.0, 1.0, 0.0, feedrate, predicted)
     late_s = np.cumsum(predicted)[5:] - np.cumsum(planned_s)[5:]
     # A block may end early by the share of a step, or of two, that the next one loses.
     assert np.all(late_s < 1.5e-4)
@@ -123,7 +131,7 @@ def test_what_a_stand_is_too_short_is_made_up_for() -> None:
     ends_s = np.cumsum(planned_s)
     per_mm, fastest = 80.0, np.full(4, 500.0)
     blocks = Blocks(ours, steps, steps / per_mm, ends_s, planned_s, fastest, fastest)
-    assign_rates(blocks, free, free, 1.0, 2e6, 0.0, 120.0, 0.0, feedrate, predicted)
+    assign_rates(blocks, free, free, 1.0, 2e6, 0.0, 120.0, 1.0, 0.0, feedrate, predicted)
     assert predicted[1] == pytest.approx(1 / 120.0, rel=1e-3)
     assert np.sum(predicted) == pytest.approx(ends_s[-1], abs=1e-4)
 
@@ -142,7 +150,7 @@ def test_with_classic_jerk_fast_moves_start_as_slowly_as_the_one_before(
     ends_s = np.cumsum(planned_s)
     at_once = np.full(n, jerk)
     blocks = Blocks(ours, steps, steps / per_mm, ends_s, planned_s, fastest, at_once)
-    assign_rates(blocks, none, none, first_steps, 2e6, 0.0, 120.0, 0.0, feedrate, predicted)
+    assign_rates(blocks, none, none, first_steps, 2e6, 0.0, 120.0, 1.0, 0.0, feedrate, predicted)
     firmware = FIRMWARE.model_copy(update={"variant": variant, "junction": "classic_jerk"})
     firmware = firmware.model_copy(update={"min_steps_per_segment": 1})
     limits = {"accel_x_mm_s2": 20_000.0, "travel_accel_mm_s2": 20_000.0, "jerk_x_mm_s": jerk}
@@ -262,6 +270,22 @@ def test_a_print_is_compensated_and_its_limits_come_back(tmp_path: Path, cache: 
     assert last[8:11] == (1500.0, 500.0, 1800.0)
     assert last[:8] == initial_limits(firmware).as_row()[:8]
     assert last[15:17] == (0.02, 20_000.0)
+
+
+def test_fast_travels_of_a_slow_machine_are_in_time(tmp_path: Path, cache: Path) -> None:
+    """M204 P500: moves were too short to stop within the queue, and first ones held up the next."""
+    facts = {"home_mm": (0.0, 0.0, 0.0), "min_steps_per_segment": 6}
+    stock = FIRMWARE.model_copy(update={**facts, "steps_per_mm": PerAxis(x=80, y=80, z=400, e=93)})
+    command = CommandLimits(accel_mm_s2=1500.0)
+    machine = with_firmware(stock).model_copy(update={"command": command})
+    walls = "\n".join(
+        f"G1 X{x} Y{y} F9000\nG1 E1 F2400\nG1 X{x + 5} E.165 F1200\nG1 Y{y + 5} E.165\nG1 E-1 F2400"
+        for x, y in ((60, 60), (150, 70), (80, 150), (160, 160)) * 2
+    )
+    text = "M201 X500 Y500\nM204 P500 T500\n" + HEAD + walls + "\nG28 X\n"
+    result, _ = compensated(text, tmp_path, cache, machine)
+    assert result.put_back == []
+    assert result.emission_max_um < 60.0
 
 
 def test_a_machine_that_times_parts_of_steps_is_compensated(tmp_path: Path, cache: Path) -> None:

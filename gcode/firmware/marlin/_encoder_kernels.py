@@ -29,6 +29,7 @@ def thin(
     start_s: Any,
     group: Any,
     least: int,
+    room: Any,
     rate: float,
     burst: float,
     corexy: bool,
@@ -48,6 +49,8 @@ def thin(
     end_s, group : ndarray, shape (n,)
     start_s : ndarray, shape (groups,)
         When each group starts.
+    room : ndarray, shape (n,)
+        Steps that a vertex should be from the one before, if more than `least`.
     keep : ndarray of bool, shape (n,)
         Filled. A vertex that is left out gives its time and filament to the next; the last of a
         stretch is always kept, and the ones before it go where it would be too near.
@@ -64,7 +67,8 @@ def thin(
         for k in range(i, stop - 1):
             before_s = end_s[k - 1] if k > i else start_s[g]
             stock = min(stock + rate * (end_s[k] - before_s), burst)
-            far = _hop(steps[k], steps[last] if last >= 0 else begin[g], corexy) >= least
+            hop_steps = _hop(steps[k], steps[last] if last >= 0 else begin[g], corexy)
+            far = hop_steps >= max(least, room[k])
             keep[k] = far and stock >= 1.0
             if keep[k]:
                 stock -= 1.0
@@ -219,6 +223,7 @@ def assign_rates(
     timer_hz: float,
     smoothing_hz: float,
     least_hz: float,
+    first_share: float,
     start_s: float,
     feedrate: Array,
     predicted_s: Array,
@@ -241,6 +246,8 @@ def assign_rates(
         Of the step timer; rate up to which parts of a step are timed, each in whole ticks.
     least_hz : float
         Lowest step rate; the difference to slower motion or standstill is carried over too.
+    first_share : float
+        Share of its time in which a stretch's first segment would be over at the rate that it gets.
     feedrate, predicted_s : ndarray, shape (n,)
         Filled.
     """
@@ -268,7 +275,7 @@ def assign_rates(
         wanted = end_s[i] + late - now - correction_s[i]
         if first:
             # The first step from rest takes up to 1/120 s: the stretch begins after it.
-            wanted = planned_s[i]
+            wanted = first_share * planned_s[i]
         hurried = RUSH * path / planned_s[i] + RUSH_MM_S
         least = path / min(fastest_mm_s[i], hurried)
         available = max(wanted, least)

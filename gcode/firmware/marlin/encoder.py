@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import cast
+from typing import NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,6 +77,9 @@ _PASSES = 10
 _DRIFT_PASSES, _DRIFT_LINES, _EARLIER = 25, 257, 0.3
 """Passes against lateness that adds up, of which the best counts; the lines over which it is
 averaged, and the share of it by which lines are to end earlier in the next pass."""
+_FIRST_SHARE = 0.5
+"""Of a stretch's first line that is not to hold up the next: a ramp from rest takes twice as long
+as the way at its final speed."""
 _TIME_TOLERANCE_S = 5e-5
 _BYTES_PER_LINE = 36.0
 """Length of a written line with line number, checksum and its share of the acknowledgement, and a
@@ -130,6 +133,25 @@ def stream_limits(
     )
 
 
+class _Way(NamedTuple):
+    """A way to encode a piece.
+
+    Attributes
+    ----------
+    least_hz : float
+        Step rate of starts from rest.
+    late : bool
+        The piece came late: steps of E are in moves that bear them, moves are long enough for the
+        queue to stop within its own, and first lines do not hold up the ones after them.
+    earlier : float
+        Share of their lateness in the pass before by which lines are to end earlier, on average.
+    """
+
+    least_hz: float
+    late: bool
+    earlier: float = 0.0
+
+
 class MarlinEncoder:
     """Encode pieces for one machine.
 
@@ -172,6 +194,7 @@ class MarlinEncoder:
             self._start_hz = np.inf
         self._turns_by_feed = by_deviation and firmware.small_segment_junctions
         self._first_steps = float(facts[C_FIRST_STEPS])
+        self._ahead = firmware.block_buffer_size - 3
         self._burst = 0.5 * firmware.block_buffer_size
         low, high = steps_within(travel_mm, self._scale)
         self._lattice = Lattice(
@@ -207,40 +230,32 @@ class MarlinEncoder:
         limits = stream_limits(own, self._command, self._mesh_slope)
         # The motors' full acceleration is better than a late piece. Where that does not help, what
         # each corner costs adds up faster than its corrections settle.
-        feeds = self._turns_by_feed
         ways = [
-            (self._start_hz, 0.0, False),
-            (self._start_hz, 0.0, feeds),
-            (np.inf, 0.0, feeds),
-            (np.inf, _EARLIER, feeds),
+            _Way(self._start_hz, late=False),
+            _Way(self._start_hz, late=True),
+            _Way(np.inf, late=True),
+            _Way(np.inf, late=True, earlier=_EARLIER),
         ]
         for way in dict.fromkeys(ways):
-            encoded, on_time = self._with_starts(piece, timeline, segments, limits, way)
+            encoded, on_time = self._in_one_way(piece, timeline, segments, limits, way)
             if on_time:
                 break
         return encoded
 
-    def _with_starts(
+    def _in_one_way(
         self,
         piece: Piece,
         timeline: Timeline,
         segments: Segments,
         limits: MarlinLimits,
-        way: tuple[float, float, bool],
+        way: _Way,
     ) -> tuple[Encoded, bool]:
-        """Encode in one way; return also whether the motion keeps up.
-
-        Parameters
-        ----------
-        way : (float, float, bool)
-            Step rate of starts from rest; share of their lateness in the pass before by which
-            lines are to end earlier, on average; whether the steps of E are placed.
-        """
-        least_hz, earlier, feeds = way
-        on_steps = self._on_steps(timeline, segments, limits, least_hz)
-        segments = with_advance(self._firmware, piece, timeline, on_steps, whole=not feeds)
-        if feeds:
-            accel = gentle_accel_mm_s2(self._command, least_hz)
+        """Encode in one way; return also whether the motion keeps up."""
+        places = way.late and self._turns_by_feed
+        on_steps = self._on_steps(timeline, segments, limits, way)
+        segments = with_advance(self._firmware, piece, timeline, on_steps, whole=not places)
+        if places:
+            accel = gentle_accel_mm_s2(self._command, way.least_hz)
             segments = with_placed_steps(
                 timeline, segments, self._scale[3], accel, corexy=self._corexy
             )
@@ -252,15 +267,15 @@ class MarlinEncoder:
             moves,
             limits,
             self._command,
-            least_hz=least_hz,
-            ahead=self._firmware.block_buffer_size - 3,
+            least_hz=way.least_hz,
+            ahead=self._ahead,
             corexy=self._corexy,
-            steps_placed=feeds,
+            steps_placed=places,
         )
         correction_s = np.zeros(len(moves.row))
         while True:
             in_force = limits_in_force(piece, moves.row, levels.limits, levels.level)
-            feedrate, phases = self._rates(moves, begin_s, speed, correction_s, earlier, *in_force)
+            feedrate, phases = self._rates(moves, begin_s, speed, correction_s, way, *in_force)
             raised = levels.raise_late(phases)
             if not np.any(raised):
                 break
@@ -275,7 +290,7 @@ class MarlinEncoder:
         begin_s: float,
         speed_mm_s: NDArray[np.float64],
         correction: NDArray[np.float64],
-        earlier: float,
+        way: _Way,
         limits_id: NDArray[np.int32],
         limits: Sequence[Limits],
     ) -> tuple[NDArray[np.float64], Phases]:
@@ -289,6 +304,7 @@ class MarlinEncoder:
         at_once = self._at_once(start_mm, end_mm, path, limits_id, limits)
         blocks = Blocks(ours, steps, path, moves.end_s, moves.planned_s, fastest, at_once)
         feedrate, predicted, early_s = np.zeros((3, len(ours)))
+        earlier, first_share = way.earlier, _FIRST_SHARE if way.late else 1.0
         best: tuple[float, NDArray[np.float64], Phases] = (np.inf, feedrate, phases)
         for attempt in range(_DRIFT_PASSES if earlier else _PASSES):
             blocks = blocks._replace(end_s=moves.end_s - early_s)
@@ -300,6 +316,7 @@ class MarlinEncoder:
                 self._firmware.step_timer_hz,
                 self._firmware.step_smoothing_hz,
                 self._least_hz,
+                first_share,
                 begin_s,
                 feedrate,
                 predicted,
@@ -342,19 +359,21 @@ class MarlinEncoder:
         return replace(moves, position=position, begin=to_units(piece.moves.start_mm[0]))
 
     def _on_steps(
-        self, timeline: Timeline, segments: Segments, limits: MarlinLimits, least_hz: float
+        self, timeline: Timeline, segments: Segments, limits: MarlinLimits, way: _Way
     ) -> Segments:
         """Put the vertices on whole steps, and leave out those that would be swallowed."""
         if len(segments) == 0:
             # X and Y of the whole piece move by less than a step.
             return segments
         scale = self._scale[:3]
-        gentle = gentle_accel_mm_s2(self._command, least_hz)
+        gentle = gentle_accel_mm_s2(self._command, way.least_hz)
         lattice = replace(self._lattice, fast_accel_mm_s2=gentle)
         wish = vertices_on_steps(lattice, timeline, segments)
         steps = np.round(wish.end_mm[:3].T * scale).astype(np.int64)
         begin = np.round(timeline.group_start_mm[:, :3] * scale).astype(np.int64)
-        keep = np.ones(len(wish), np.bool_)
+        keep, room = np.ones(len(wish), np.bool_), np.zeros(len(wish))
+        if way.late:
+            room = self._room_to_stop(wish, timeline, gentle)
         thin(
             steps,
             begin,
@@ -362,6 +381,7 @@ class MarlinEncoder:
             timeline.start_s,
             wish.group,
             self._lattice.least,
+            room,
             self._rate,
             self._burst,
             self._corexy,
@@ -376,6 +396,20 @@ class MarlinEncoder:
         end_mm[:2, inner] = (steps[inner, :2] / scale[:2]).T
         classic = self._firmware.junction == "classic_jerk"
         return climb_in_long_moves(chosen, timeline, scale[2], limits, classic_jerk=classic)
+
+    def _room_to_stop(
+        self, wish: Segments, timeline: Timeline, accel_mm_s2: float
+    ) -> NDArray[np.float64]:
+        """Return how many steps each move should have so that the queue is long enough to stop."""
+        room = np.zeros(len(wish))
+        for group, rows in wish.stretches():
+            place_mm = np.vstack([timeline.group_start_mm[group], wish.end_mm[:, rows].T])
+            takes_s = np.diff(np.append(timeline.start_s[group], wish.end_s[rows]))
+            way_mm = np.diff(place_mm[:, :3], axis=0)
+            speed_mm_s = np.hypot(*way_mm[:, :2].T) / takes_s
+            rate = np.max(self._motors(way_mm * self._scale[:3]), axis=1) / takes_s
+            room[rows] = speed_mm_s * rate / (2.0 * accel_mm_s2 * (self._ahead - 1))
+        return room
 
     def _blocks(
         self, start_mm: NDArray[np.float64], end_mm: NDArray[np.float64]
