@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.alignment import check_pair
@@ -35,7 +36,11 @@ __all__ = [
 ]
 
 _LEAST_SHARE, _LEAST_COUNT = 0.1, 30
-_PRINTERS_HZ = 150.0
+_WIDEST_GAP = 4.0
+"""Ratio of the frequencies between which the motion may not follow. Where guides that rub hold an
+axis from 16 to 100 Hz, the maximum below that is friction's and no resonance; beyond a resonance
+that is seen, axes that rub were without coherence for a ratio of up to 3.3."""
+_SLOWEST_HZ, _PRINTERS_HZ = 5.0, 150.0
 """Printers have their modes below this frequency: a model need not follow above it."""
 _HIGHEST_TEST_HZ, _WIDER = 300.0, 1.4
 """Klipper's largest max_freq, and how far a test should go beyond a resonance."""
@@ -264,10 +269,32 @@ def _check_coherent(one: FrequencyResponse | Spectrum, names: str) -> None:
     top_hz = max(_PRINTERS_HZ, float(one.f_hz[follows].max(initial=0.0)))
     of = int(np.count_nonzero(one.f_hz <= top_hz))
     if count >= min(_LEAST_COUNT, of) and count >= _LEAST_SHARE * of:
+        _check_gap(one, follows, names)
         return
     raise ModelError(
         f"{names}: the motion follows the command at {count} of {of} frequencies between "
         f"{one.f_hz.min():.1f} and {min(top_hz, one.f_hz.max()):.1f} Hz (coherence "
         f"{LEAST_COHERENCE:g} or more, side by side); {_LEAST_COUNT} and {_LEAST_SHARE:.0%} of "
         f"them are needed, so no model follows from it. {_MEASURE}"
+    )
+
+
+def _check_gap(one: FrequencyResponse, follows: NDArray[np.bool_], names: str) -> None:
+    """Refuse a motion that does not follow its command where a printer has its resonance."""
+    at = np.flatnonzero(follows & (one.f_hz >= _SLOWEST_HZ))
+    known_hz = one.f_hz[at]
+    if len(at) < 2:
+        return
+    # Frequencies of a sparse sweep are apart, too, with nothing between them.
+    ratio = np.where(np.diff(at) > 1, known_hz[1:] / known_hz[:-1], 1.0)
+    widest = int(np.argmax(ratio))
+    low_hz, high_hz = known_hz[widest : widest + 2]
+    if ratio[widest] <= _WIDEST_GAP or low_hz >= _PRINTERS_HZ:
+        return
+    raise ModelError(
+        f"{names}: the motion does not follow the command between {low_hz:.1f} and {high_hz:.1f} "
+        f"Hz (coherence below {LEAST_COHERENCE:g}; at most a factor of {_WIDEST_GAP:g} may lie "
+        "between frequencies that it follows): a resonance there was not measured. An axis whose "
+        "guides rub much sticks while it is driven so little: look for what rubs or is loose, or "
+        "test with a larger accel_per_hz, and measure again"
     )

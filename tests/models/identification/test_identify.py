@@ -592,6 +592,20 @@ def test_a_mode_beyond_the_band_is_not_the_main_one_for_want_of_damping(
         check_informative(fit, (), ["a.csv"])
 
 
+@pytest.mark.parametrize(("to_hz", "refused"), [(50.0, False), (95.0, True)])
+def test_an_axis_that_sticks_where_it_has_its_resonance_is_refused(
+    to_hz: float, *, refused: bool
+) -> None:
+    """What friction leaves below was taken for the axis: 16 to 100 Hz were not measured."""
+    seen = response(one_mode(14.0, 0.3))
+    sticks = (F_HZ > 16.0) & (to_hz > F_HZ)
+    seen = replace(seen, coherence=np.where(sticks, 0.1, 0.999))
+    fit = Fit(one_mode(14.0, 0.3), 0.02, 1.0, 0.0, (6.0, 134.0), ())
+    words = r"raw\.csv: .* does not follow the command between 15\.6 and 95\.1 Hz .* accel_per_hz"
+    with pytest.raises(ModelError, match=words) if refused else nullcontext():
+        check_informative(fit, [seen], ["raw.csv"])
+
+
 def test_repeats_alone_make_a_set_of_what_explains_them() -> None:
     found = one(*(quick_raw("x", seed=k) for k in range(3)))
     assert found.member_fits == ()
