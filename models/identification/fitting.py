@@ -107,7 +107,7 @@ def fit_response(
         tried.append(_best_of_order(data, order, tried[-1] if tried else None))
         if progress:
             progress(order / max_order)
-        if tried[-1].missed < _EXPLAINED * data.noise:
+        if tried[-1].nrmse < _EXPLAINED * data.noise:
             break
     chosen = _without_fillers(data, _by_the_knee(tried, data.noise))
     chosen = _without_far_zero(data, _calm_beyond(data, chosen))
@@ -115,15 +115,10 @@ def fit_response(
     return replace(_as_fit(data, chosen), trials=trials)
 
 
-def refit_response(measured: FrequencyResponse, like: Fit, *, on_time: bool = False) -> Fit:
+def refit_response(measured: FrequencyResponse, like: Fit) -> Fit:
     """Fit a plant with the pairs of `like`, starting from it: a member of its set.
 
     A zero keeps its side of the imaginary axis.
-
-    Parameters
-    ----------
-    on_time : bool
-        Fit a plant that does not delay slow motion.
 
     Raises
     ------
@@ -133,12 +128,11 @@ def refit_response(measured: FrequencyResponse, like: Fit, *, on_time: bool = Fa
     if not isinstance(like.spec, PairsSpec):
         raise ModelError("a plant of pairs is needed to start from; fit a response first")
     data = response_data(measured)
-    structure = PairStructure(len(like.spec.poles), len(like.spec.zeros), data.unit_hz, on_time)
+    structure = PairStructure(len(like.spec.poles), len(like.spec.zeros), data.unit_hz)
     theta = structure.parameters(like.spec)
     ratio = data.response / structure.response(theta, data.f_hz)
     start = with_gain(data, structure, theta, low_frequency_delay(data.f_hz, ratio))
-    real_zero = on_time or like.spec.real_zero_tau_s != 0.0
-    fitted = _polished(data, start, _sides(start), real_zero=real_zero)
+    fitted = _polished(data, start, _sides(start), real_zero=like.spec.real_zero_tau_s != 0.0)
     return replace(_as_fit(data, fitted), trials=(OrderTrial(structure.poles, fitted.nrmse),))
 
 
@@ -177,7 +171,7 @@ def _with_zeros_in_band(data: ResponseData, fit: _Candidate) -> _Candidate:
 def _stands(data: ResponseData, simpler: _Candidate, fit: _Candidate, *, clearly: bool) -> bool:
     """Whether the measurement does not tell a simpler fit from `fit`, or not `clearly`."""
     share = 1 / _CLEARLY if clearly else _NO_WORSE
-    return simpler.missed < max(share * fit.missed, _EXPLAINED * data.noise)
+    return simpler.nrmse < max(share * fit.nrmse, _EXPLAINED * data.noise)
 
 
 def _mirrored(data: ResponseData, fit: _Candidate, sides: Array) -> _Candidate:
@@ -224,8 +218,8 @@ def _by_the_knee(tried: list[_Candidate], noise: float) -> _Candidate:
     chosen = tried[0]
     for larger in tried[1:]:
         pairs = larger.structure.poles - chosen.structure.poles
-        clearly = larger.missed < _CLEARLY**pairs * chosen.missed
-        if chosen.missed > _EXPLAINED * noise and clearly:
+        clearly = larger.nrmse < _CLEARLY**pairs * chosen.nrmse
+        if chosen.nrmse > _EXPLAINED * noise and clearly:
             chosen = larger
     return chosen
 
@@ -249,7 +243,7 @@ def _without_far_zero(data: ResponseData, fit: _Candidate) -> _Candidate:
     sides = _sides(fit)
     sides[0] = 0.0
     without = _polished(data, fit, sides, real_zero=False)
-    no_worse = without.missed < max(_NO_WORSE * fit.missed, _EXPLAINED * data.noise)
+    no_worse = without.nrmse < max(_NO_WORSE * fit.nrmse, _EXPLAINED * data.noise)
     return without if no_worse else fit
 
 

@@ -1,9 +1,9 @@
-"""Fit modes, or pairs that do not delay slow motion, to a measured frequency response.
+"""Fit modes, with a delay no larger than guides cause, to a measured frequency response.
 
 Pairs of poles and zeros (`fitting`) explain any response, but their delay of slow motion trades off
-with the start of the recording, and is unbounded: so they are fitted again without one. Where modes
-damped by relative speed (`modal_structure`) explain as much, they are used: part of their damping
-may act against the frame, so that slow motion is delayed by at most d/k.
+with the start of the recording, and is unbounded. Where modes damped by relative speed
+(`modal_structure`) explain as much, they are used: part of their damping may act against the frame,
+so that slow motion is delayed by at most d/k.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from stillpath.models.arrays import Array, Complex
+from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.averaging import low_frequency_delay, mean_response
 from stillpath.models.identification.fitting import fit_response, refit_response
@@ -74,14 +74,12 @@ def fit_modes(
 ) -> Fit:
     """Fit modes to a frequency response, or pairs where modes do not explain it as well.
 
-    What a plant misses counts as it is used, slow motion on time.
-
     Parameters and errors as of `fitting.fit_response`.
     """
     single = measured if isinstance(measured, FrequencyResponse) else mean_response(measured)
     data = response_data(single)
     fitted = fit_response(single, max_order=max_order, progress=progress)
-    pairs = replace(refit_response(single, fitted, on_time=True), trials=fitted.trials)
+    pairs = _as_used(data, fitted)
     found = _orders(data, pairs, max_order)
     if not found:
         return pairs
@@ -89,13 +87,14 @@ def fit_modes(
     modes = [replace(_as_used(data, _as_fit(data, c)), trials=trials) for c in found]
     # Modes that cancel each other explain much, and nobody knows where they are.
     modes = [fit for fit in modes if main_mode_known(fit)] or modes
-    by_pairs, *by_modes = (data.missed(_error(data, fit)) for fit in (pairs, *modes))
-    enough = _enough(data, min(by_pairs, *by_modes))
-    chosen, missed = modes[0], by_modes[0]
-    for larger, by_larger in zip(modes[1:], by_modes[1:], strict=True):
-        if missed > enough and by_larger < _CLEARLY * missed:
-            chosen, missed = larger, by_larger
-    explained = missed <= max(enough, by_pairs)
+    # Pairs whose slow motion is late by much explain a response, but are not used as fitted.
+    least = min(pairs.residual, max(fitted.residual, min(fit.residual for fit in modes)))
+    enough = _enough(data, least)
+    chosen = modes[0]
+    for larger in modes[1:]:
+        if chosen.residual > enough and larger.residual < _CLEARLY * chosen.residual:
+            chosen = larger
+    explained = chosen.residual <= max(enough, pairs.residual)
     return chosen if explained or not main_mode_known(pairs) else pairs
 
 
@@ -108,7 +107,7 @@ def refit(measured: FrequencyResponse, like: Fit) -> Fit:
         If too few points are left to fit.
     """
     if isinstance(like.spec, PairsSpec):
-        return refit_response(measured, like, on_time=True)
+        return _as_used(response_data(measured), refit_response(measured, like))
     if not isinstance(like.spec, RelativeModesSpec):
         raise ModelError("a plant of modes or pairs is needed to start from; fit a response first")
     data = response_data(measured)
@@ -126,7 +125,7 @@ def alternatives(measured: FrequencyResponse, fit: Fit) -> tuple[Fit, ...]:
     if not isinstance(fit.spec, RelativeModesSpec):
         return ()
     data = response_data(measured, fit.band_hz)
-    enough = _enough(data, data.missed(_error(data, fit)))
+    enough = _enough(data, fit.residual)
     modes = fit.spec.modes
     starts = [_grown(data, fit.spec, fit.delay_s)]
     if len(modes) > 1:
@@ -134,7 +133,7 @@ def alternatives(measured: FrequencyResponse, fit: Fit) -> tuple[Fit, ...]:
         kept = [m for m in modes if m is not weakest]
         starts.append(of_poles(data, [(m.f_hz, m.zeta) for m in kept]))
     tried = [_calm(data, _polished(data, s)) for s in starts if s is not None]
-    return tuple(_as_fit(data, t) for t in tried if t.missed <= enough and _all_ring(t))
+    return tuple(_as_fit(data, t) for t in tried if t.nrmse <= enough and _all_ring(t))
 
 
 def _as_used(data: ResponseData, fit: Fit) -> Fit:
@@ -144,18 +143,13 @@ def _as_used(data: ResponseData, fit: Fit) -> Fit:
     delay slow motion by their grounded damping only: they count as fitted unless that is more than
     guides do, or the plant is grossly another one.
     """
-    missed = np.linalg.norm(_error(data, fit)) / np.linalg.norm(data.response)
+    turned = np.exp(-2j * np.pi * data.f_hz * (fit.delay_s + delay_of(fit.spec)))
+    model = fit.gain * turned * frequency_response(prompt(fit), data.f_hz)
+    missed = np.linalg.norm(model - data.response) / np.linalg.norm(data.response)
     likely = missed <= _GROSS and _LATE_S[0] <= delay_of(fit.spec) <= _LATE_S[1]
     if isinstance(fit.spec, RelativeModesSpec) and likely:
         return fit
     return replace(fit, residual=max(fit.residual, float(missed)))
-
-
-def _error(data: ResponseData, fit: Fit) -> Complex:
-    """Return by how much the plant that is made of a fit misses the response."""
-    turned = np.exp(-2j * np.pi * data.f_hz * (fit.delay_s + delay_of(fit.spec)))
-    model = fit.gain * turned * frequency_response(prompt(fit), data.f_hz)
-    return np.asarray(model - data.response)
 
 
 def _all_ring(fit: Modal) -> bool:
@@ -164,9 +158,9 @@ def _all_ring(fit: Modal) -> bool:
     return bool(np.all((np.abs(share) > _LEAST_PEAK * 2 * zeta) & (np.abs(share) > _LEAST_SHARE)))
 
 
-def _enough(data: ResponseData, missed: float) -> float:
-    """Return what a fit may miss that explains as much as one that misses `missed`."""
-    return max(_AS_GOOD * missed, _EXPLAINED * data.noise, _IRRELEVANT)
+def _enough(data: ResponseData, residual: float) -> float:
+    """Return the residual with which a fit explains as much as one with `residual`."""
+    return max(_AS_GOOD * residual, _EXPLAINED * data.noise, _IRRELEVANT)
 
 
 def _orders(data: ResponseData, pairs: Fit, max_order: int) -> list[Modal]:
@@ -180,7 +174,7 @@ def _orders(data: ResponseData, pairs: Fit, max_order: int) -> list[Modal]:
             continue
         best = _polished(data, min(tried, key=lambda c: c.cost))
         found.append(_calm(data, best))
-        if found[-1].missed < _EXPLAINED * data.noise:
+        if found[-1].nrmse < _EXPLAINED * data.noise:
             break
     return found
 
@@ -268,7 +262,7 @@ def _calm(data: ResponseData, fit: Modal) -> Modal:
     if np.all(fit.structure.split(fit.theta)[1] >= least):
         return fit
     calm = _polished(data, fit, least)
-    return fit if calm.missed > _EXPLAINED * max(fit.missed, data.noise) else calm
+    return fit if calm.nrmse > _EXPLAINED * max(fit.nrmse, data.noise) else calm
 
 
 def _as_fit(data: ResponseData, found: Modal) -> Fit:

@@ -8,7 +8,7 @@ fitted as logarithms. Frequencies are in units of `unit_hz`, so that all paramet
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -30,17 +30,11 @@ class PairStructure:
 
     The vector is [tau, log f of the poles, log zeta of the poles, log f of the zeros, zeta of the
     zeros]; tau in units of 1/(2 pi unit_hz).
-
-    Attributes
-    ----------
-    on_time : bool
-        The pairs determine tau so that slow motion is not delayed; that of the vector is ignored.
     """
 
     poles: int
     zeros: int
     unit_hz: float
-    on_time: bool = False
 
     @property
     def size(self) -> int:
@@ -51,10 +45,8 @@ class PairStructure:
         """Return tau, log f and log zeta of the poles, log f and zeta of the zeros."""
         n, m = self.poles, self.zeros
         cuts = np.cumsum([1, n, n, m])
-        tau, log_f, log_z, log_fz, zz = np.split(np.asarray(theta, float), cuts)
-        if self.on_time:
-            tau = np.array([np.sum(_lags(log_f, np.exp(log_z))) - np.sum(_lags(log_fz, zz))])
-        return float(tau[0]), log_f, log_z, log_fz, zz
+        tau, *rest = np.split(np.asarray(theta, float), cuts)
+        return float(tau[0]), rest[0], rest[1], rest[2], rest[3]
 
     def response(self, theta: Array, f_hz: Array) -> Complex:
         """Return G at the frequencies, shape (len(f_hz),)."""
@@ -72,10 +64,9 @@ class PairStructure:
         poles = _factors(x, log_f, zeta)
         zeros = _factors(x, log_fz, zz) + _SMALL
         over_pole, over_zero = x[:, None] / np.exp(log_f), x[:, None] / np.exp(log_fz)
-        by_tau = (x / (1 + tau * x))[:, None]
-        gradient = np.concatenate(
+        return np.concatenate(
             [
-                0.0 * by_tau if self.on_time else by_tau,
+                (x / (1 + tau * x))[:, None],
                 2 * over_pole * (zeta + over_pole) / poles,
                 -2 * zeta * over_pole / poles,
                 -2 * over_zero * (zz + over_zero) / zeros,
@@ -83,11 +74,6 @@ class PairStructure:
             ],
             axis=1,
         )
-        if not self.on_time:
-            return gradient
-        by_pole, by_zero = _lags(log_f, zeta), _lags(log_fz, zz)
-        tau_by = np.concatenate([-by_pole, by_pole, by_zero, -2 / np.exp(log_fz)])
-        return np.asarray(gradient + by_tau * np.append(0.0, tau_by))
 
     def extended(self, theta: Array, f_hz: float, zeta: float = 0.1) -> tuple[PairStructure, Array]:
         """Return a structure with one more pole pair at `f_hz`, a zero pair near it, and start."""
@@ -95,7 +81,7 @@ class PairStructure:
         log_new = np.log(f_hz / self.unit_hz)
         poles = [np.append(log_f, log_new), np.append(log_z, np.log(zeta))]
         zeros = [np.append(log_fz, log_new + 0.03), np.append(zz, zeta)]
-        larger = replace(self, poles=self.poles + 1, zeros=self.zeros + 1)
+        larger = PairStructure(self.poles + 1, self.zeros + 1, self.unit_hz)
         return larger, np.concatenate([[tau], *poles, *zeros])
 
     def without(self, theta: Array, pole: int) -> tuple[PairStructure, Array]:
@@ -104,7 +90,7 @@ class PairStructure:
         zero = int(np.argmin(np.abs(log_fz - log_f[pole]))) if self.zeros else 0
         kept = [np.delete(v, pole) for v in (log_f, log_z)]
         kept += [np.delete(v, zero) if self.zeros else v for v in (log_fz, zz)]
-        smaller = replace(self, poles=self.poles - 1, zeros=max(self.zeros - 1, 0))
+        smaller = PairStructure(self.poles - 1, max(self.zeros - 1, 0), self.unit_hz)
         return smaller, np.concatenate([[tau], *kept])
 
     def parameters(self, spec: PairsSpec) -> Array:
@@ -156,11 +142,6 @@ class PairStructure:
         _, log_f, _, _, _ = self.split(theta)
         beyond = np.exp(log_f) * self.unit_hz > top_hz
         return np.where(beyond, max(UNSEEN_ZETA, least), least)
-
-
-def _lags(log_f: Array, zeta: Array) -> Array:
-    """Return by how much every pair delays slow motion (of zeros: less), in units of tau."""
-    return np.asarray(2 * zeta / np.exp(log_f))
 
 
 def _factors(x: Complex, log_f: Array, zeta: ArrayLike) -> Complex:

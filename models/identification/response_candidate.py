@@ -37,20 +37,11 @@ S = TypeVar("S", bound=Structure)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidate(Generic[S]):
-    """Parameters [log gain, delay (unit 1/(2 pi unit_hz)), theta ...] of a structure.
-
-    Attributes
-    ----------
-    nrmse : float
-        Root of sum |error|^2 over sum |response|^2: what is missed of the resonance, mostly.
-    missed : float
-        The same with the weights of the data: where an axis follows its command counts as much.
-    """
+    """Parameters [log gain, delay (unit 1/(2 pi unit_hz)), theta ...] of a structure."""
 
     structure: S
     vector: Array
     nrmse: float = np.inf
-    missed: float = np.inf
     cost: float = np.inf
 
     @property
@@ -93,7 +84,7 @@ def judged(data: ResponseData, candidate: Candidate[S]) -> Candidate[S]:
     error = candidate.model(data.f_hz) - data.response
     soft = np.sqrt(1 + np.abs(data.weight * error) ** 2) - 1
     nrmse = float(np.linalg.norm(error) / np.linalg.norm(data.response))
-    return replace(candidate, nrmse=nrmse, missed=data.missed(error), cost=float(soft.sum()))
+    return replace(candidate, nrmse=nrmse, cost=float(soft.sum()))
 
 
 def least_error(

@@ -23,8 +23,6 @@ _LEAST_POINTS = 12
 _LEAST_RUN = 0.01
 """Share of all points that must be coherent side by side: a few among noise are so by chance."""
 _UNKNOWN_NOISE = 0.005
-_LEAST_NOISE = 0.01
-"""Of repeats that scatter; what they share with their neighbours hides from third differences."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,7 +32,7 @@ class ResponseData:
     Attributes
     ----------
     noise : float
-        What the noise alone leaves (`missed`).
+        NRMSE that the noise alone leaves.
     delay_s : float
         First guess, right to a millisecond or so.
     """
@@ -55,12 +53,6 @@ class ResponseData:
     def band_hz(self) -> tuple[float, float]:
         """Lowest and highest frequency."""
         return float(self.f_hz[0]), float(self.f_hz[-1])
-
-    def missed(self, error: Complex) -> float:
-        """Return the size of an error over that of the response, both weighted."""
-        return float(
-            np.linalg.norm(self.weight * error) / np.linalg.norm(self.weight * self.response)
-        )
 
     def thinned(self, points: int) -> ResponseData:
         """Return about `points` of them, evenly."""
@@ -114,9 +106,7 @@ def response_data(
     noise = np.where(known, sd, min(_roughness(h), _UNKNOWN_NOISE) * size)
     floor = _RELATIVE_FLOOR * np.maximum(size, np.median(size[:9]))
     weight = 1 / np.maximum(np.where(known, sd, 0.0), floor)
-    share = float(np.linalg.norm(weight * noise) / np.linalg.norm(weight * size))
-    # Repeats also differ smoothly, as the machine drifts: a fit to their mean leaves none of that.
-    share = min(share, max(_roughness(h), _LEAST_NOISE))
+    share = float(np.linalg.norm(noise) / np.linalg.norm(size))
     return ResponseData(f, h, np.asarray(weight, np.float64), share, delay, tuple(warnings))
 
 

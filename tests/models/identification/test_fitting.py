@@ -82,7 +82,7 @@ def test_order_follows_what_the_noise_leaves_to_see() -> None:
     assert [t.order for t in fit.trials] == [1, 2, 3]
     assert residuals[0] > 0.3 > residuals[1] > 0.01 > residuals[2]
     # As much noise as the third mode shows in the band: two suffice.
-    assert fit_response(measured(plant, noise=0.15)).order == 2
+    assert fit_response(measured(plant, noise=0.08)).order == 2
     assert fit_response(measured(modal(TRUTH[:1], (1.0,)), noise=0.03)).order == 1
 
 

@@ -124,7 +124,7 @@ def test_files_go_to_their_axes() -> None:
         about = found[axis].plants.provenance  # type: ignore[index]
         assert about is not None
         assert (about.kind, about.sources, about.measured_on) == ("raw log", (file.source,), day)
-        assert main_mode(found[axis]) == pytest.approx(f_hz, rel=2e-3)  # type: ignore[index]
+        assert main_mode(found[axis]) == pytest.approx(f_hz, rel=1e-3)  # type: ignore[index]
     assert all(1 < len(one.plants.weighted_members()) <= 16 for one in found.values())
 
 
@@ -258,9 +258,8 @@ def test_a_response_that_may_not_be_1_at_low_frequency(gain: float) -> None:
     scaled = response(plant)
     scaled = replace(scaled, response=gain * scaled.response)
     found = identify([at(scaled)])["x"]
-    told = [re.findall(r"is (\S+) times the command", w) for w in found.warnings]
-    times = [float(one) for (one,) in filter(None, told)]
-    assert times == ([] if gain == 1.0 else [pytest.approx(abs(gain), rel=1e-2)])
+    told = [f"is {abs(gain):.3g} times the command" in w for w in found.warnings]
+    assert any(told) if gain != 1.0 else not told
     np.testing.assert_allclose(
         np.abs(frequency_response(found.plants.nominal, F_HZ)),
         np.abs(frequency_response(plant, F_HZ)),
@@ -443,9 +442,9 @@ def test_moving_mass_from_two_raw_logs() -> None:
     mass = mass_of(found)
     assert mass.moving_mass_kg == pytest.approx(0.8, rel=0.01)
     assert mass.modes == (0,)
-    assert main_mode(found) == pytest.approx(35.0, rel=2e-3)  # the empty bed's
+    assert main_mode(found) == pytest.approx(35.0, rel=1e-3)  # the empty bed's
     (note,) = [n for n in found.notes if "lowered" in n]
-    assert note.startswith("0.5 kg on the bed lowered 34.96 Hz to 27.4")
+    assert note.startswith("0.5 kg on the bed lowered 35.00 Hz to 27.4")
     # The schedule's own plant with the weight is the one that was measured with it.
     heavy = mass.loaded(found.plants.nominal, 0.5)
     f = np.linspace(6.0, 60.0, 100)
@@ -457,7 +456,7 @@ def test_a_second_weight_checks_the_first() -> None:
     runs = [quick_raw("y", loaded(kg), condition=f"+{kg}kg") for kg in (0.2, 0.5)]
     found = one(quick_raw("y", loaded(0.0)), *runs)
     assert mass_of(found).moving_mass_kg == pytest.approx(0.8, rel=0.01)
-    assert "0.2 kg on the bed: 31.28 Hz, by that mass 31.28 Hz" in found.notes
+    assert "0.2 kg on the bed: 31.30 Hz, by that mass 31.30 Hz" in found.notes
 
 
 def test_repeats_with_a_weight_are_one_run() -> None:
@@ -509,7 +508,7 @@ def test_heights_make_a_grid() -> None:
     assert grid is not None
     assert [node.z_mm for node in grid.nodes] == [0.0, 100.0, 200.0]
     (told,) = [note for note in found.notes if "follows the place" in note]
-    assert told.endswith("at z=0 43.99 Hz; z=100 41.98 Hz; z=200 39.98 Hz")
+    assert told.endswith("at z=0 44.00 Hz; z=100 42.00 Hz; z=200 40.00 Hz")
     for node, f_hz in zip(grid.nodes, (44.0, 42.0, 40.0), strict=True):
         assert isinstance(node.plant, PairsSpec)
         assert node.plant.poles[0].f_hz == pytest.approx(f_hz, rel=1e-3)

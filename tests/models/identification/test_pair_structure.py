@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import control
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stillpath.models.identification.pair_structure import PairStructure
-from stillpath.models.identification.prompt import delay_of
 from stillpath.models.plants import PairsSpec, PolePair, ZeroPair
 
 F = np.linspace(1.0, 150.0, 60)
@@ -24,7 +21,7 @@ SPEC = PairsSpec(
 @st.composite
 def vectors(draw: st.DrawFn) -> tuple[PairStructure, np.ndarray]:
     n = draw(st.integers(1, 4))
-    structure = PairStructure(n, n - 1, 26.0, on_time=draw(st.booleans()))
+    structure = PairStructure(n, n - 1, 26.0)
     log_f = st.floats(-1.5, 1.5)
     tau = draw(st.floats(-0.5, 0.5))
     poles = [draw(log_f) for _ in range(n)] + [draw(st.floats(-4, 0)) for _ in range(n)]
@@ -65,16 +62,6 @@ def test_gradient_is_the_derivative(case: tuple[PairStructure, np.ndarray]) -> N
         exact = gradient[:, i] * structure.response(theta, F)
         scale = np.abs(exact).max() + np.abs(numeric).max()
         np.testing.assert_allclose(exact, numeric, atol=2e-5 * scale + 1e-9)
-
-
-@settings(max_examples=50)
-@given(vectors())
-def test_pairs_on_time_do_not_delay_slow_motion(case: tuple[PairStructure, np.ndarray]) -> None:
-    structure, theta = replace(case[0], on_time=True), case[1]
-    slow_hz = np.array([1e-4])
-    assert abs(np.angle(structure.response(theta, slow_hz)[0])) < 1e-9
-    spec = structure.spec(theta)
-    assert abs(delay_of(spec)) < 1e-5 / (2 * np.pi * structure.unit_hz)
 
 
 def test_a_mode_beyond_the_band_may_not_ring_by_chance() -> None:
