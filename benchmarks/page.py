@@ -185,7 +185,7 @@ def page(results: Sequence[Result]) -> str:
 def readme_figures(results: Sequence[Result]) -> str:
     """Return what stands in README.md between the marks: the twins and the virtual printers."""
     by_name = {result.name: result for result in results}
-    twins, chain = by_name["twins"], by_name["closed_chain"]
+    twins, others, chain = (by_name[name] for name in ("twins", "other_twins", "closed_chain"))
     ratios = [
         float(str(row[k]))
         for row in twins.rows
@@ -206,6 +206,16 @@ def readme_figures(results: Sequence[Result]) -> str:
         f"Geometric mean of the {len(ratios)} ratios: {mean:.2f}. In {len(worse)} of them the "
         f"shaper is better by more than 1 %, by {100 * (max(ratios) - 1):.0f} % at most."
     )
+    head = next(c.head() for c in others.columns if c.unit == "× best shaper")
+    elsewhere = [float(str(row[others.column(head)])) for row in others.rows]
+    head = next(c.head() for c in others.columns if c.unit == "× recommended shaper")
+    recommended = [float(str(row[others.column(head)])) for row in others.rows]
+    more = (
+        f"**On {len(elsewhere)} plants fitted to other tables** of such printers: "
+        f"{geometric_mean(recommended):.2f} of the error with the shapers\nthat Klipper's rules "
+        f"recommend from those tables (worst {max(recommended):.2f}), and "
+        f"{geometric_mean(elsewhere):.2f} of that with the best shaper."
+    )
     virtual = (
         "**On virtual printers** (motors, belts, dry friction, frames; measured, identified, "
         "compensated, printed),\nagainst the shaper that Klipper's rules recommend: from resonance "
@@ -215,7 +225,7 @@ def readme_figures(results: Sequence[Result]) -> str:
         f"The goals for the mean were {goal(0)} and {goal(2)}:\n"
         "[what falls short, and why](docs/benchmarks.md#the-closed-chain)."
     )
-    return "\n\n".join([table(twins.columns, twins.rows), beaten, virtual])
+    return "\n\n".join([table(twins.columns, twins.rows), beaten, more, virtual])
 
 
 def with_figures(readme: str, figures: str) -> str:
