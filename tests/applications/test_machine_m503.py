@@ -388,7 +388,7 @@ def test_the_command_has_room_above_what_the_printer_allows(make, capsys) -> Non
     ("room", "limits"),
     [
         (None, ("X500.00 Y600.00", "P510.00 R520.00 T530.00")),
-        (1.5, ("X500.00 Y600.00", "P510.00 R520.00 T530.00")),
+        (1.2, ("X500.00 Y600.00", "P510.00 R520.00 T530.00")),
         # As 34 of Marlin's example configurations: travel has twice the acceleration.
         (None, ("X1000.00 Y1000.00", "P500.00 R500.00 T1000.00")),
     ],
@@ -412,7 +412,7 @@ def test_low_limits_leave_enough_for_the_print_s_speed(
     result, _ = compensated(text, folder, tmp_path / "cache", machine)
     reasons = [one.reason for one in result.put_back]
     assert len(reasons) == (0 if room is None else 1)
-    assert all("command.accel_mm_s2 (750) is low: raise it" in reason for reason in reasons)
+    assert all("command.accel_mm_s2 (600) is low: raise it" in reason for reason in reasons)
 
 
 def test_an_axis_that_may_more_bears_more(make, capsys) -> None:
