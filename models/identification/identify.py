@@ -32,14 +32,12 @@ from stillpath.models.identification.frame import LIKELY, likely_of
 from stillpath.models.identification.friction import Friction, better_explained, dry_friction, freed
 from stillpath.models.identification.messages import (
     body_notes,
-    by_file,
     fit_warnings,
     frame_mode_warnings,
     friction_notes,
     level_warnings,
     mounting_notes,
     no_frame_note,
-    parted,
     phase_fault,
     phase_warning,
     scale_warnings,
@@ -88,6 +86,7 @@ from stillpath.models.identification.types import (
     PlantModel,
     Spectrum,
 )
+from stillpath.models.notes import by_file, parted
 from stillpath.models.plants import ParametricMembers, PlantSetSpec, PlantSpec
 from stillpath.models.provenance import Kind, SourceFile
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import numpy as np
@@ -24,12 +24,12 @@ from stillpath.models.identification.types import (
     FrequencyResponse,
     Spectrum,
 )
+from stillpath.models.notes import WarningNote, by_file
 from stillpath.models.plants import PairsSpec, PlantSetSpec, PlantSpec, RelativeModesSpec
 
 __all__ = [
     "apart_warning",
     "body_notes",
-    "by_file",
     "cross_axis_warning",
     "fit_warnings",
     "frame_mode_warnings",
@@ -37,7 +37,6 @@ __all__ = [
     "level_warnings",
     "mounting_notes",
     "no_frame_note",
-    "parted",
     "phase_fault",
     "phase_warning",
     "scale_warnings",
@@ -76,15 +75,6 @@ _BETWEEN = (
     "X nor Y"
 )
 _LEAST_POINTS, _SLOPE_TOLERANCE = 4, 0.2
-_WARNING = "warning: "
-
-
-def by_file(told: Iterable[tuple[str, str]]) -> list[str]:
-    """Group messages by their text, with the names of all files in front of it."""
-    sources: dict[str, list[str]] = {}
-    for source, text in dict.fromkeys(told):
-        sources.setdefault(text, []).append(source)
-    return [f"{', '.join(names)}: {text}" for text, names in sources.items()]
 
 
 def mounting_notes(axis: str, responses: Sequence[FrequencyResponse]) -> list[str]:
@@ -97,7 +87,7 @@ def mounting_notes(axis: str, responses: Sequence[FrequencyResponse]) -> list[st
             notes.append((response.source, _turned_text(most, axis, "log")))
         alike = [name for name, share in along.items() if share > _ALIKE]
         if len(alike) == 2:
-            notes.append((response.source, _WARNING + _BETWEEN.format(*alike)))
+            notes.append((response.source, WarningNote(_BETWEEN.format(*alike))))
     return by_file(notes)
 
 
@@ -113,9 +103,9 @@ def table_mounting_notes(
     notes = []
     for source, most, share in moved:
         if most != axis and share > _MOSTLY:
-            kind = _WARNING if most in "xy" and not turned else ""
+            kind = WarningNote if most in "xy" and not turned else str
             cause = _COPIED if (axis, most) == ("x", "y") else ""
-            notes.append((source, kind + _turned_text(most, axis, "table") + cause))
+            notes.append((source, kind(_turned_text(most, axis, "table") + cause)))
     return notes
 
 
@@ -196,14 +186,6 @@ def unvaried_notes(plants: PlantSetSpec) -> tuple[str, ...]:
         "were exact; give its modes, or zeros and poles"
     )
     return (note,)
-
-
-def parted(told: Iterable[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Part notes from those that a reader calls a warning."""
-    told = tuple(told)
-    warned = tuple(text for text in told if _WARNING in text)
-    notes = tuple(text for text in told if text not in warned)
-    return notes, tuple(text.replace(_WARNING, "", 1) for text in warned)
 
 
 def fit_warnings(fit: Fit, sources: Sequence[str], warned: Sequence[str]) -> tuple[str, ...]:
@@ -303,12 +285,12 @@ def strength_notes(response: FrequencyResponse, test: Excitation) -> tuple[str, 
     if gain is None or not as_long or not weaker < 1.0 or abs(gain / weaker - 1.0) > _AS_WEAK:
         return ()
     text = (
-        f"warning: below 15 Hz the axis moved {gain:.2f} times as much as accel_per_hz = "
+        f"below 15 Hz the axis moved {gain:.2f} times as much as accel_per_hz = "
         f"{test.accel_per_hz_mm_s:g} commands, which is Kalico's. Klipper since 2024-12 has "
         f"{usual.accel_per_hz_mm_s:g}, also with sweeping_period 0: state yours (accel_per_hz). If "
         "it is right, the axis rubs much, or the sensor's scale is off"
     )
-    return (text,)
+    return (WarningNote(text),)
 
 
 def scale_warnings(responses: Sequence[FrequencyResponse], fit: Fit) -> list[str]:

@@ -9,6 +9,7 @@ import numpy as np
 from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.readers.tables import Table
+from stillpath.models.notes import WarningNote
 
 __all__ = [
     "RANGE_ENDED",
@@ -151,7 +152,7 @@ def check_alive(
 def check_range(
     columns: dict[str, Array], source: str = "", along: Sequence[str] = ()
 ) -> tuple[str, ...]:
-    """Return a warning if a sensor's readings stop at a value that they reach often.
+    """Return a `WarningNote` if a sensor's readings stop at a value that they reach often.
 
     An extreme is rare: where more samples lie on it than in the next part of the range, the
     sensor's own range ended there.
@@ -166,7 +167,7 @@ def check_range(
     ModelError
         If one of these often lies there, again and again: no test would tell its damping.
     """
-    found = []
+    found: list[str] = []
     for name, values in columns.items():
         for side in (1.0, -1.0):
             up = side * values
@@ -186,7 +187,7 @@ def check_range(
             times = np.count_nonzero(there[1:] & ~there[:-1])
             if name in along and often > _MOST_STOPPED * len(up) and times > _OFTEN:
                 raise ModelError(f"{source}: {text}")
-            found.append(f"warning: {text}")
+            found.append(WarningNote(text))
     return tuple(found[:1])
 
 
