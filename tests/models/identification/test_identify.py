@@ -15,7 +15,7 @@ from scipy.signal import hilbert
 
 from stillpath.applications.identification.run import InputFile, identify_files
 from stillpath.models.errors import ModelError
-from stillpath.models.identification.conditioned import Tested, of_one_test
+from stillpath.models.identification.conditioned import SpectrumRun, of_one_test
 from stillpath.models.identification.conditions import Condition
 from stillpath.models.identification.identify import Measured, identify
 from stillpath.models.identification.messages import (
@@ -732,10 +732,10 @@ def test_spectra_of_different_labels_have_no_mean() -> None:
 def test_logs_that_become_spectra_keep_the_most_of_one_test() -> None:
     """Where no model explains the phase of raw logs of several tests."""
 
-    def tested(name: str, test: Excitation, condition: str = "") -> Tested:
+    def tested(name: str, test: Excitation, condition: str = "") -> SpectrumRun:
         (file,) = read(spectrum_file(one_mode(50.0, 0.06), QUICK, name=name))
         assert isinstance(file.measurement, Spectrum)
-        return file.measurement, test, Condition.parse(condition)
+        return SpectrumRun(file.measurement, test, Condition.parse(condition))
 
     old, new, again, loaded = (
         tested("20240101_120000", LEGACY),
@@ -744,8 +744,8 @@ def test_logs_that_become_spectra_keep_the_most_of_one_test() -> None:
         tested("20240101_140000", LEGACY, "+0.5kg"),
     )
     kept, notes = of_one_test([old, new, again, loaded], "x")
-    assert [s.source for s, _, _ in kept] == [s.source for s, _, _ in (new, again, loaded)]
-    assert [old[0].source in note for note in notes] == [True]
+    assert kept == [new, again, loaded]
+    assert [old.spectrum.source in note for note in notes] == [True]
 
 
 # Progress
