@@ -12,7 +12,7 @@ from stillpath.models.errors import ModelError
 from stillpath.models.friction import LEAST_MM_S2, Guides
 from stillpath.models.identification.estimation import plateau_gain
 from stillpath.models.identification.nozzle import Frame
-from stillpath.models.identification.readers.checks import RANGE_ENDED
+from stillpath.models.identification.readers.checks import RangeEnded
 from stillpath.models.identification.readers.spectra import GAINS_TEXT
 from stillpath.models.identification.spectrum_model import moved_most
 from stillpath.models.identification.trust import main_mode, main_mode_known
@@ -238,7 +238,7 @@ def phase_fault(found: AxisIdentification) -> str | None:
 
 def phase_warning(axis: str, fault: str, notes: Sequence[str]) -> str:
     """Say why of logs with these notes only the magnitude is used."""
-    clipped = any(RANGE_ENDED in note for note in notes)
+    clipped = any(isinstance(note, RangeEnded) for note in notes)
     cause, remedy = (
         ("the sensor's range ended", "Set a larger range, or test with a lower accel_per_hz")
         if clipped

@@ -12,7 +12,7 @@ from stillpath.models.identification.readers.tables import Table
 from stillpath.models.notes import WarningNote
 
 __all__ = [
-    "RANGE_ENDED",
+    "RangeEnded",
     "check_alive",
     "check_long",
     "check_range",
@@ -20,9 +20,6 @@ __all__ = [
     "check_steady",
     "sensor_axes",
 ]
-
-RANGE_ENDED = "its range ended"
-"""Part of the warning, and of the refusal."""
 
 _RATES_HZ = (10.0, 1e6)
 _LONGEST_S = 3600.0
@@ -149,10 +146,16 @@ def check_alive(
     return (f"the sensor's {_listed(dead)} is constant",) if dead else ()
 
 
+class RangeEnded(WarningNote):
+    """A warning that the sensor's range ended, so that the phase of its log may tell nothing."""
+
+    __slots__ = ()
+
+
 def check_range(
     columns: dict[str, Array], source: str = "", along: Sequence[str] = ()
 ) -> tuple[str, ...]:
-    """Return a `WarningNote` if a sensor's readings stop at a value that they reach often.
+    """Return a `RangeEnded` if a sensor's readings stop at a value that they reach often.
 
     An extreme is rare: where more samples lie on it than in the next part of the range, the
     sensor's own range ended there.
@@ -180,14 +183,14 @@ def check_range(
             unit = " mm/s^2" if name in "xyz" else ""
             text = (
                 f"the sensor's {name} stops at {side * top:.6g}{unit}, {often} samples lie "
-                f"there: {RANGE_ENDED}, and damping comes out too large; test with a lower "
+                "there: its range ended, and damping comes out too large; test with a lower "
                 "accel_per_hz, or set a larger range"
             )
             # Something that came to rest at its extreme lies there once, for long.
             times = np.count_nonzero(there[1:] & ~there[:-1])
             if name in along and often > _MOST_STOPPED * len(up) and times > _OFTEN:
                 raise ModelError(f"{source}: {text}")
-            found.append(WarningNote(text))
+            found.append(RangeEnded(text))
     return tuple(found[:1])
 
 

@@ -26,6 +26,7 @@ from stillpath.models.identification.messages import (
 from stillpath.models.identification.modal_fit import fit_modes
 from stillpath.models.identification.prompt import prompt
 from stillpath.models.identification.readers import ReadSettings, read_content
+from stillpath.models.identification.readers.checks import RangeEnded
 from stillpath.models.identification.synthetic import Sensor, simulate_spectrum
 from stillpath.models.identification.trust import check_informative
 from stillpath.models.identification.types import (
@@ -352,7 +353,7 @@ def test_a_sensor_whose_range_ended_in_a_recorded_drive() -> None:
                 read(file)
 
 
-@pytest.mark.parametrize("notes", [(), ("the sensor's x stops at 9: its range ended",)])
+@pytest.mark.parametrize("notes", [(), (RangeEnded("the sensor's x stops at 9"),)])
 def test_friction_is_not_blamed_for_a_sensor_whose_range_ended(notes: tuple[str, ...]) -> None:
     assert ("friction" in phase_warning("x", "nothing fits", notes)) is not bool(notes)
 
