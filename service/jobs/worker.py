@@ -23,7 +23,7 @@ from typing import Any, TypeVar
 
 import structlog
 
-from stillpath.pipeline.progress import Cancelled, Progress
+from stillpath.pipeline.progress import Progress, StopWork
 from stillpath.service.database.engine import DatabaseAway, StoreError, open_database
 from stillpath.service.environment import prepare_environment
 from stillpath.service.jobs.computations import run_computation
@@ -220,7 +220,7 @@ def _attempt(
                 if isinstance(error, StorageError) and workplace.settings.storage_url is not None:
                     return _no_room_in_storage(job, workplace)
                 return _no_room(job, workplace, written)
-    except Cancelled:
+    except StopWork:
         return None
     except MemoryError:
         what = "The system refused its process more memory"
