@@ -367,7 +367,7 @@ class PipelineRun:
         piece, paced : Piece
             As sliced, and as planned at the new pace.
         """
-        writer, checker = copy.copy(self._writer), None
+        writer, checker = self._writer.snapshot(), None
         try:
             with self._clock.stage("compensate"):
                 made = self._designed.compensate(paced, self._point)
