@@ -12,9 +12,10 @@ import pytest
 
 from stillpath.service.database.engine import DatabaseAway
 from stillpath.service.jobs import reconciler
+from stillpath.service.jobs.attempt import Workplace
 from stillpath.service.jobs.reconciler import Reconciler
 from stillpath.service.jobs.state import WAITING_FOR_ROOM, Claimed, Job, JobState, Lost, OutOfRoom
-from stillpath.service.jobs.worker import Workplace, execute
+from stillpath.service.jobs.worker import execute
 from tests.service.jobs.site import Site
 from tests.service.runners import light
 from tests.service.small_disk import small_disk
