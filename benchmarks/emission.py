@@ -27,10 +27,10 @@ from stillpath.gcode.types import Phases
 from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine
 from stillpath.pipeline.files import default_cache_dir
-from stillpath.pipeline.job import Attempt, Job
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.order import Order
 from stillpath.pipeline.piece_compensator import CompensatedPiece
+from stillpath.pipeline.pipeline_run import Attempt, PipelineRun
 from stillpath.pipeline.result import Result
 
 _BIN_UM, _BINS = 0.01, 40_000
@@ -63,7 +63,7 @@ class Spread:
         return float(_BIN_UM * (1 + np.searchsorted(total, share * total[-1])))
 
 
-class Watched(Job):
+class Watched(PipelineRun):
     """The pipeline, with every verified piece measured."""
 
     def prepare(self) -> None:
@@ -119,40 +119,40 @@ def watched(
     """Compensate a file on the watched pipeline."""
     options = Options(tolerance_um=tolerance_um)
     with source.open("rb") as text, target.open("wb") as written:
-        job = Watched(text, written, Order(machine, options, cache))
-        job.prepare()
-        return job, job.run(source.name, SlicerFacts())
+        run = Watched(text, written, Order(machine, options, cache))
+        run.prepare()
+        return run, run.write(source.name, SlicerFacts())
 
 
 def measure(source: Path, machine: Machine, tolerance_um: float, cache: Path) -> str:
     """Return a table row for one case."""
     with tempfile.TemporaryDirectory(prefix="stillpath-emission-") as folder:
         target = Path(folder) / "out.gcode"
-        job, result = watched(source, target, machine, tolerance_um, cache)
+        run, result = watched(source, target, machine, tolerance_um, cache)
         total_mm = read_motion(source, machine).end_mm[-1, 3]
         filament_mm = abs(read_motion(target, machine).end_mm[-1, 3] - total_mm)
     hours = result.compensated_s / 3600.0
-    q, q_print = job.xy.quantile(0.999), job.xy_extruding.quantile(0.999)
+    q, q_print = run.xy.quantile(0.999), run.xy_extruding.quantile(0.999)
     checks = {
         "99.9 %": q <= tolerance_um + 1,
         # At sudden starts the firmware, which keeps what the motors bear, is a little late.
-        "max": job.xy.max <= tolerance_um + 20,
-        "E": job.filament.max <= 3,
+        "max": run.xy.max <= tolerance_um + 20,
+        "E": run.filament.max <= 3,
         # A stretch that begins or ends steeply is late by up to .25 ms.
-        "time": abs(job.late_s) <= 10e-3 * hours,
+        "time": abs(run.late_s) <= 10e-3 * hours,
         "E total": filament_mm <= 1e-4,
-        "end": job.end_mm <= 1e-6,
+        "end": run.end_mm <= 1e-6,
         "put back": result.put_back_extruding_share <= 0.01,
     }
     bad = [name for name, good in checks.items() if not good]
     return (
         f"{source.stem[:25]:26}{machine.name[:13]:14}{tolerance_um:4g} "
-        f"{q:6.2f} {job.xy.max:7.2f} {q_print:6.2f} {job.xy_extruding.max:7.2f} "
-        f"{job.filament.max:6.2f} {1e3 * job.late_s / hours:+8.3f} "
-        f"{1e3 * job.off_grid_s / hours:+8.2f} {filament_mm:9.1e} {job.end_mm:8.1e} "
+        f"{q:6.2f} {run.xy.max:7.2f} {q_print:6.2f} {run.xy_extruding.max:7.2f} "
+        f"{run.filament.max:6.2f} {1e3 * run.late_s / hours:+8.3f} "
+        f"{1e3 * run.off_grid_s / hours:+8.2f} {filament_mm:9.1e} {run.end_mm:8.1e} "
         f"{len(result.put_back):3d}/{100 * result.put_back_extruding_share:.2f}%  "
         f"{'MISS ' + ', '.join(bad) if bad else 'PASS'}"
-        f" (max at line {job.xy.line}; E at line {job.filament.line})"
+        f" (max at line {run.xy.line}; E at line {run.filament.line})"
     )
 
 

@@ -50,19 +50,25 @@ class Detection:
 
 @dataclass(frozen=True, slots=True)
 class _Sign:
+    """Evidence for a dialect, but not where the machine has one that is `shared_with`."""
+
     dialect: str
     weight: float
     pattern: re.Pattern[bytes]
     reason: str
+    shared_with: str = ""
 
 
-def _sign(dialect: str, weight: float, pattern: bytes, reason: str) -> _Sign:
-    return _Sign(dialect, weight, re.compile(pattern, re.MULTILINE), reason)
+def _sign(
+    dialect: str, weight: float, pattern: bytes, reason: str, *, shared_with: str = ""
+) -> _Sign:
+    return _Sign(dialect, weight, re.compile(pattern, re.MULTILINE), reason, shared_with)
 
 
 _MOVES = re.compile(rb"^(?:G[01] .*\n)+", re.MULTILINE)
 # Commands stand at the start of a line, after blanks and a line number.
 _LINE = rb"^[ \t]*(?:N\d+[ \t]+)?"
+_BUDDY = "commands of the Buddy firmware (M555, M74, M572 S, ...)"
 _SIGNS = (
     # What the slicer calls its flavour, and the printer it sliced for.
     _sign("klipper", 3, rb"^; ?gcode_flavor = klipper\b", "gcode_flavor = klipper"),
@@ -149,29 +155,29 @@ _SIGNS = (
         _LINE + rb"(?:M1002 |M620 S|M621 S|M622 J|M970\.3|M975 S)",
         "Bambu's commands (M1002, M620, M975, ...)",
     ),
-    _sign(
-        "prusa",
-        2,
-        _LINE + rb"(?:M555 X|M74 W|M572 S|P0 S1|M593 [XY].*A)",
-        "commands of the Buddy firmware (M555, M74, M572 S, ...)",
-    ),
+    _sign("prusa", 2, _LINE + rb"(?:M555 X|M74 W|P0 S1|M593 [XY].*A)", _BUDDY),
+    # Without D it is for the tool in use (Move::ConfigurePressureAdvance, Move.cpp, 2024-10).
+    _sign("prusa", 2, _LINE + rb"M572 S", _BUDDY, shared_with="reprapfirmware"),
     _sign("marlin", 1, _LINE + rb"M900 K", "M900 K"),
     _sign("marlin", 1, _LINE + rb"(?:M205 [XYJ]|M420 S|M413 S)", "M205, M420 or M413"),
     _sign("marlin", 0.5, _LINE + rb"M201 X\S+ Y\S.*\n.*M203 X\d{1,3}\b", "M203 with mm/s"),
 )
 
 
-def detect(head: bytes, tail: bytes = b"") -> Detection:
+def detect(head: bytes, tail: bytes = b"", *, machine: str | None = None) -> Detection:
     """Return the firmware that a file was written for.
 
     Parameters
     ----------
     head, tail : bytes
         The two ends of its text; a quarter of a megabyte of each is looked at.
+    machine : str, optional
+        Dialect of the machine that is to print it: commands that it reads are no sign of another.
     """
     # Moves are most of the text, and no sign matches them.
     text = _MOVES.sub(b"\n", head[:_HEAD_BYTES] + b"\n" + tail[-_TAIL_BYTES:])
-    found = [sign for sign in _SIGNS if sign.pattern.search(text)]
+    signs = [sign for sign in _SIGNS if machine is None or sign.shared_with != machine]
+    found = [sign for sign in signs if sign.pattern.search(text)]
     weights = dict.fromkeys(DIALECTS, 0.0)
     for sign in found:
         weights[sign.dialect] += sign.weight

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillpath.models.errors import ModelError
+from stillpath.models.notes import WarningNote
 
 __all__ = [
     "Roots",
@@ -108,8 +109,8 @@ def normalise_dc(roots: Roots) -> tuple[Roots, tuple[str, ...]]:
     if off > 1e-9:
         text = f"DC gain {gain:.6g} scaled to 1"
         if off > _NOTE:
-            text = f"warning: {text}; more than {_NOTE:.0%} off, check sensor gain and direction"
-        notes = (text,)
+            text = f"{text}; more than {_NOTE:.0%} off, check sensor gain and direction"
+        notes = (WarningNote(text) if off > _NOTE else text,)
     return replace(roots, gain=1.0), notes
 
 

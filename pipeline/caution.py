@@ -43,7 +43,7 @@ from stillpath.simulation.measures import PathDistances
 from stillpath.simulation.response import response
 
 __all__ = [
-    "Choice",
+    "Mixture",
     "Mixtures",
     "Shares",
     "best_shares",
@@ -75,8 +75,8 @@ _NO_RESTS = np.zeros((0, 2), np.int64)
 
 
 @dataclass(frozen=True, slots=True)
-class Choice:
-    """The mixture chosen for a machine, and its errors over the set on the reference motion.
+class Mixture:
+    """A mixture for a machine, and its errors over the set on the reference motion.
 
     Attributes
     ----------
@@ -169,7 +169,7 @@ def set_or_nominal(mode: str, design: Callable[[str], T]) -> T:
 
 def caution_for(
     machine: Machine, options: Options, shaper: BestShaper, directory: Path, dt_s: float
-) -> tuple[Caution, Choice] | None:
+) -> tuple[Caution, Mixture] | None:
     """Return the mixture for `robust=auto` and the reason; None where no shaper is mixed in."""
     if options.vibration != "fbf" or options.robust != "auto":
         return None
@@ -189,7 +189,7 @@ def choose_caution(
     dt_s: float,
     basis: str = DEFAULT_BASIS,
     mode: str = "ensemble",
-) -> tuple[Caution, Choice]:
+) -> tuple[Caution, Mixture]:
     """Choose the mixture of compensation and shaper for a machine, once per machine revision.
 
     Parameters
@@ -213,9 +213,9 @@ def choose_caution(
     )
 
 
-def _read(document: dict[str, Any]) -> Choice:
+def _read(document: dict[str, Any]) -> Mixture:
     ranges = {name: ErrorRange(**known) for name, known in document["ranges"].items()}
-    return Choice(**{**document, "shares": tuple(document["shares"]), "ranges": ranges})
+    return Mixture(**{**document, "shares": tuple(document["shares"]), "ranges": ranges})
 
 
 class Mixtures:
@@ -284,7 +284,7 @@ def best_shares(cost: Callable[[Shares], float], most: Sequence[float]) -> Share
 
 def _chosen_by_trial(
     machine: Machine, shaper: BestShaper, dt_s: float, basis: str, mode: str
-) -> Choice:
+) -> Mixture:
     path, extruding = reference_motion_of(machine, dt_s)
     most_shares = [most_share(machine.axes[axis]) for axis in ("x", "y")]
     exact, smooth = _commands(machine, shaper, basis, dt_s, mode if any(most_shares) else None)
@@ -293,10 +293,10 @@ def _chosen_by_trial(
     none_mm = np.maximum(mixtures.errors_mm(mixtures.answers(path)), 1e-12)
 
     @cache
-    def choice(shares: Shares) -> Choice:
+    def choice(shares: Shares) -> Mixture:
         ours_mm = np.maximum(mixtures.errors_mm(exact_mm, shares), 1e-12)
         ratio = ours_mm / mixtures.shaped_mm
-        return Choice(
+        return Mixture(
             shares,
             float(ratio.max()),
             mixtures.mean(ratio),
@@ -355,7 +355,7 @@ def _strong(machine: Machine) -> Machine:
     return machine.model_copy(update={"command": command})
 
 
-def _rank(choice: Choice) -> float:
+def _rank(choice: Mixture) -> float:
     """Return the cost of a choice: the mean over likely members plus the worst one's excess."""
     return choice.mean + _PRICE * max(0.0, choice.worst - 1.0)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from stillpath.models.machine import Machine
 from stillpath.models.typed_in import stated_hz
-from stillpath.pipeline.caution import Choice
+from stillpath.pipeline.caution import Mixture
 from stillpath.pipeline.error_range import unseen_friction_mm
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
 
@@ -24,7 +24,7 @@ def stated_note(machine: Machine, shaper: BestShaper) -> str | None:
     )
 
 
-def prediction_note(machine: Machine, choice: Choice) -> str:
+def prediction_note(machine: Machine, choice: Mixture) -> str:
     """Return a note on the plants behind the predictions, and how far they differ."""
     measured = []
     for axis, plants in sorted(machine.axes.items()):

@@ -1,7 +1,7 @@
 """The pipeline: a print file in, a compensated and verified file out, in bounded memory.
 
-A job (`pipeline.job`) writes the file once. It is run again with less compensation or speed where
-the file is too large, exceeds a budget, or is refused by the last check.
+Each `PipelineRun` writes the file once. It is written again with less compensation or speed where
+it is too large, exceeds a budget, or is refused by the last check.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from stillpath.gcode.errors import GcodeError
 from stillpath.models.machine import Machine
 from stillpath.pipeline.file_rewriting import FileRewriting, file_rewriting
 from stillpath.pipeline.files import check_unchanged
-from stillpath.pipeline.job import COMPENSATED, Job
 from stillpath.pipeline.last_check.errors import LastCheckError
 from stillpath.pipeline.live_printing import keep_file, predict_live, simulate_live
 from stillpath.pipeline.measuring.tracing import Trace
 from stillpath.pipeline.options import Options, unused
 from stillpath.pipeline.order import Order
 from stillpath.pipeline.pacing.budget import SpeedBudget
+from stillpath.pipeline.pipeline_run import COMPENSATED, PipelineRun
 from stillpath.pipeline.progress import ProgressCallback, within
 from stillpath.pipeline.result import Result
 from stillpath.pipeline.selection import TooLarge, smaller
@@ -51,7 +51,7 @@ def compensate_file(
     cache_dir : Path, optional
         Where the tuned shaper of a machine revision is kept.
     progress : callable, optional
-        Called from time to time; may raise `Cancelled`.
+        Called from time to time; may raise `StopWork`.
     layers : Path, optional
         Folder for layers.json and layers.bin (`pipeline.measuring.layer_files`).
     trace : callable, optional
@@ -101,20 +101,20 @@ def _rewrite(
     plate, progress = order.options.plate, order.progress
     opened = file_rewriting(source, target, plate=plate, layers=layers, progress=progress)
     with opened as file:
-        job, result = _final_job(file, order, source.name, trace)
-        job.deliver(file.text)
+        run, result = _final_run(file, order, source.name, trace)
+        run.deliver(file.text)
         if order.options.times == "new":
-            file.container.delay(job.delay_s)
+            file.container.delay(run.delay_s)
     return result.model_copy(update=file.sizes)
 
 
-def _final_job(
+def _final_run(
     file: FileRewriting,
     order: Order,
     name: str,
     trace: Callable[[Trace], None] | None,
-) -> tuple[Job, Result]:
-    """Run jobs until the file fits, keeps the budget and passes the check; return that job.
+) -> tuple[PipelineRun, Result]:
+    """Run the pipeline until the file fits, keeps the budget and passes the check; return that run.
 
     A piece that the last check refuses stays as sliced, like one that any other check refuses.
     """
@@ -126,22 +126,22 @@ def _final_job(
     times = _each_time(order.progress, several=again)
     while True:
         asked = replace(order, progress=next(times))
-        job = Job(file.container.text, file.spool, asked, layers, traced, budget)
+        run = PipelineRun(file.container.text, file.spool, asked, layers, traced, budget)
         try:
-            result = job.run(name, file.container.facts())
-            gentler = job.gentler
+            result = run.write(name, file.container.facts())
+            gentler = run.gentler
             if gentler is None and traced is trace:
-                return job, job.checked(result)
+                return run, run.checked(result)
         except (TooLarge, LastCheckError) as error:
             if isinstance(error, TooLarge):
                 order = replace(order, options=_fitting(order.options, name))
             else:
-                order = order.reverting(error, job.compensated)
+                order = order.reverting(error, run.compensated)
             budget = budget and budget.again()
         else:
             if gentler is None:
                 traced = trace  # accepted: repeat it unchanged for the trace
-            budget = gentler or job.same
+            budget = gentler or run.same
         file.spool.seek(0)
         file.spool.truncate()
         layers = layers.anew() if layers is not None else None

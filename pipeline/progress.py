@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-__all__ = ["Cancelled", "Progress", "ProgressCallback", "ProgressReports", "progress_to", "within"]
+__all__ = ["Progress", "ProgressCallback", "ProgressReports", "StopWork", "progress_to", "within"]
 
 
 _SURE = 0.02
@@ -38,12 +38,12 @@ class Progress:
     eta_s: float | None
 
 
-class Cancelled(Exception):
+class StopWork(Exception):
     """Raised by a progress callback: stop the job and leave nothing after."""
 
 
 ProgressCallback = Callable[[Progress], None]
-"""Called from time to time; may raise `Cancelled`."""
+"""Called from time to time; may raise `StopWork`."""
 
 
 class ProgressReports:

@@ -121,7 +121,7 @@ def doubts(file: BinaryIO, machine: Machine, name: DialectName | None = None) ->
     file.seek(0)
     head = file.read(_END_BYTES)
     file.seek(max(size - _END_BYTES, 0))
-    found = detect(head, file.read(_END_BYTES))
+    found = detect(head, file.read(_END_BYTES), machine=own.name)
     file.seek(place)
     firmware = machine.firmware
     if own.name == "marlin" and EIGHT_BIT_PRUSA in found.reasons:

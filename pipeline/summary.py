@@ -11,7 +11,7 @@ from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.slicers.facts import SlicerFacts
 from stillpath.models.confirmation import confirmation_text, rounded_um
 from stillpath.models.machine import Machine
-from stillpath.pipeline.caution import Choice
+from stillpath.pipeline.caution import Mixture
 from stillpath.pipeline.caution_notes import prediction_note, stated_note
 from stillpath.pipeline.clock import StageClock
 from stillpath.pipeline.measuring.measure import Measurement
@@ -45,7 +45,7 @@ class Summary:
     ----------
     writer : StreamWriter or None
         None: the file stays as it is, and is only measured.
-    choice : Choice or None
+    choice : Mixture or None
         The mixture chosen for the machine's set, if any.
     budget : (SpeedBudget, BudgetMeasurement) or None
     """
@@ -59,7 +59,7 @@ class Summary:
     reader: Interpreter
     writer: StreamWriter | None
     shaper: BestShaper
-    choice: Choice | None
+    choice: Mixture | None
     budget: tuple[SpeedBudget, BudgetMeasurement] | None
 
     def result(self, name: str, size: int, facts: SlicerFacts, clock: StageClock) -> Result:

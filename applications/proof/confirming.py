@@ -249,7 +249,7 @@ class _Axis:
                 f"that moves in {axis}, or its scale is wrong"
             )
         if log.clipped:
-            return f"{name}: {log.clipped.removeprefix('warning: ')}"
+            return f"{name}: {log.clipped}"
         seen = [sum(s.compensated is half for s in log.seen) for half in (False, True)]
         if min(seen) < _FEWEST_STOPS or len(log.seen) < _SEEN_SHARE * log.within:
             return (

@@ -18,7 +18,6 @@ from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware._writing_kernels import format_moves
 from stillpath.gcode.firmware.base import FirmwareAdapter, changed_limits
 from stillpath.gcode.firmware.encoding import Encoded, to_units
-from stillpath.gcode.firmware.file_shapers import ADVANCE_LEFT_OFF, FileShapers
 from stillpath.gcode.firmware.jumps import jump_lines
 from stillpath.gcode.firmware.line_reader import (
     AXES,
@@ -32,6 +31,8 @@ from stillpath.gcode.firmware.line_reader import (
 from stillpath.gcode.firmware.marking import ends_at_mark, file_text
 from stillpath.gcode.firmware.modes import WrittenModes, event_places, feed_line, written_modes
 from stillpath.gcode.firmware.planning import stops
+from stillpath.gcode.firmware.shaper_switch import ShaperSwitch
+from stillpath.gcode.firmware.written_extruder import WrittenExtruder
 from stillpath.gcode.pieces import LeftOut, Piece, VerbatimPart
 from stillpath.gcode.types import EventKind, Limits, ModalState
 
@@ -40,9 +41,6 @@ __all__ = ["StreamWriter"]
 _BYTES_PER_LINE = 96
 _LEVEL, _EVENT, _REST = range(3)
 _MAY_SET_SHAPER = (EventKind.UNKNOWN, EventKind.SHAPER)
-_LEAST_GAP_MM = 1e-7
-_FAR_MM = 10.0
-"""32-bit floats resolve a micrometre up to here."""
 
 
 class StreamWriter:
@@ -63,59 +61,42 @@ class StreamWriter:
         """The planner's limits while streaming."""
         self._stamp = stamp
         self._streaming = False
-        self._shaper_off = False
+        self._shaper = ShaperSwitch(self._stream_commands)
+        self._extruder = WrittenExtruder(self._stream_commands)
         self._marked: Limits | None = None
         """The file's limits, in force with the mark of a stream because the shaper stays off."""
-        self._advances = False
-        """Pressure advance is on, although the shaper is off."""
-        self._file_shapers = FileShapers()
         self._at_rest = True
         self._modal: ModalState | None = None
         """The printer's modes, where they may differ from the file's."""
-        self._far_mm: float | None = None
-        """The printer's E, if it must be set to 0 before a stream continues."""
-        self._zero_mm = 0.0
-        """The file's E where the printer's reads 0."""
-        self._absolute_e = self._uncounted = False
-        """The piece has absolute E; the printer's E may not count what our lines have fed."""
+        self._absolute_e = False
+        """The piece has absolute E."""
         self._file_feed_mm_min = 0.0
         self._behind: tuple[Limits, ModalState] | None = None
         """What the file had set after the last piece."""
         self._behind_mark = False
         """No move came since an object's mark."""
-        self._left_off: set[str] = set()
-        """Axes whose shaper is not stated, so that it stays off behind a stream."""
-        self._advance_left_off = False
+
+    def snapshot(self) -> StreamWriter:
+        """Return a copy that writes on from here, while this one stays as it is.
+
+        It is for one piece: what the file's own lines set is shared.
+        """
+        twin = copy.copy(self)
+        twin._shaper, twin._extruder = copy.copy(self._shaper), copy.copy(self._extruder)
+        return twin
 
     def shaper_warnings(self) -> Iterator[str]:
         """Yield warnings about the firmware's shaper, and about those that the file itself sets."""
-        if self._left_off:
-            whose = f" of {min(self._left_off)}" if len(self._left_off) == 1 else ""
-            yield (
-                f"The firmware's own input shaper{whose} is not known (firmware.shaper in the "
-                "machine): it is switched off and stays off; set it again after the print."
-            )
-        if self._advance_left_off and not self._file_shapers.sets_advance:
-            yield ADVANCE_LEFT_OFF
-        yield from self._file_shapers.warnings()
+        yield from self._shaper.warnings()
 
     def leading(self, piece: Piece, extruder_mm: float) -> bytes:
         """Return lines that take time before a piece's stream, often none; as in `piece`.
 
         They switch the shaper off. After an object's mark they are all before the stream.
         """
-        return (
-            copy.copy(self)._lead(piece, extruder_mm) if piece.after_mark else self._switching_off
-        )
-
-    @property
-    def _switching_off(self) -> bytes:
-        if self._streaming:
-            return b""
-        if self._shaper_off:
-            return self._stream_commands.advance_off if self._advances else b""
-        off = self._stream_commands.shaper_off
-        return off or (self._stream_commands.file_shaper_off if self._file_shapers.lines else b"")
+        if piece.after_mark:
+            return self.snapshot()._lead(piece, extruder_mm)
+        return b"" if self._streaming else self._shaper.off_lines()
 
     def header(self) -> bytes:
         """Return lines that say who processed the file, and what to note."""
@@ -145,7 +126,7 @@ class StreamWriter:
             For a line that must not stand in a file with a stream.
         """
         moves, events = verbatim.moves, verbatim.events
-        file_mm = extruder_mm + self._zero_mm if self._behind is not None else None
+        file_mm = extruder_mm + self._extruder.zero_mm if self._behind is not None else None
         lead = self._off(verbatim, extruder_mm)
         if self._marked is not None:
             self._marked = verbatim.limits_after
@@ -156,8 +137,7 @@ class StreamWriter:
                 raise GcodeError(conflict, line=int(events.line[row]))
             if events.kind[row] != EventKind.SHAPER or self._lines.is_move(line.split(b";", 1)[0]):
                 continue  # a line that also moves cannot be repeated
-            self._shaper_off = False
-            self._file_shapers.note(line, int(events.line[row]))
+            self._shaper.set_by_file(line, int(events.line[row]))
         if len(moves) or np.any(stops(events)):
             self._at_rest = self._rests(verbatim, at_end=True)
         where = {"marked": self._marked is not None, "behind_mark": self._behind_mark}
@@ -166,7 +146,7 @@ class StreamWriter:
 
     def piece(self, piece: Piece, encoded: Encoded, extruder_mm: float) -> bytes:
         """Return the text of a compensated piece; `extruder_mm` as in `verbatim`."""
-        self._reads(extruder_mm)
+        self._extruder.reads(extruder_mm)
         used = np.unique(piece.moves.modal_id).tolist()
         self._absolute_e = any(piece.modal[k].absolute_e for k in used)
         limits, level = encoded.limits, encoded.level
@@ -256,7 +236,12 @@ class StreamWriter:
         if SET_POSITION.match(code):
             row = min(int(events.move_index[k]), len(piece.moves) - 1)
             planned = float(piece.moves.start_mm[row, 3])
-            return line + self._set_again(line, (extruded_mm - planned) / state.extrude_factor)
+            # As it is spelt: not every firmware reads small letters.
+            value_mm = self._lines.extruder_word(line.split(b";", 1)[0])
+            if value_mm is None:
+                return line
+            ahead_mm = (extruded_mm - planned) / state.extrude_factor
+            return line + self._extruder.set_by_file(value_mm, ahead_mm)
         # Only what the line itself says changes: our own modes differ from the file's.
         if POSITIONING.match(code):
             self._modal = replace(self._modal, absolute_xyz=state.absolute_xyz)
@@ -281,11 +266,12 @@ class StreamWriter:
         alone = self._stream_commands.factors_need_axes and not AXES.search(code)
         if ends is not None:
             fed = float(moves.end_mm[row, 3]) - extruded_mm
-            lead += self._file_extruder(ends - fed / (1.0 if alone else state.extrude_factor))
-            self._reads(ends)
-        elif self._far_mm is not None and moves_on:
+            factor = 1.0 if alone else state.extrude_factor
+            lead += self._extruder.file_again(ends - fed / factor)
+            self._extruder.reads(ends)
+        elif moves_on:
             fed = float(moves.end_mm[row, 3] - moves.start_mm[row, 3])
-            self._reads(self._far_mm + fed / state.extrude_factor)
+            self._extruder.fed(fed, state.extrude_factor)
         if moves_on and not FEED.search(code):
             factor = 1.0 if alone else state.speed_factor
             lead += feed_line(float(moves.speed_mm_s[row]) * 60.0 / factor)
@@ -301,36 +287,7 @@ class StreamWriter:
         """Return lines that set the stream's limits and modes."""
         text = self._limits_to(limits) + self._file_modes(modes)
         self._modal = modes
-        self._uncounted |= self._absolute_e and not self._stream_commands.relative_moves_count
-        if self._far_mm is not None:
-            self._zero_mm += self._far_mm
-            self._far_mm = None
-            text += b"G92 E0\n"
-        return text
-
-    def _reads(self, extruder_mm: float) -> None:
-        far = self._stream_commands.coarse_extruder and abs(extruder_mm) > _FAR_MM
-        self._far_mm = extruder_mm if far else None
-
-    def _set_again(self, line: bytes, ahead_mm: float) -> bytes:
-        """Return the line after a G92 E that accounts for a lead of the extruder over the plan.
-
-        The file counts from there whenever its E is absolute, which may be much later.
-        """
-        value_mm = self._lines.extruder_word(line.split(b";", 1)[0])
-        if value_mm is None:
-            return b""
-        reads_mm = value_mm + ahead_mm
-        self._zero_mm, self._uncounted = 0.0, False
-        self._reads(reads_mm)
-        return b"" if abs(ahead_mm) < _LEAST_GAP_MM else f"G92 E{reads_mm:.7f}\n".encode()
-
-    def _file_extruder(self, file_mm: float) -> bytes:
-        """Return the line that sets the printer's E to the file's."""
-        if self._zero_mm == 0.0 and not self._uncounted:
-            return b""
-        self._zero_mm, self._uncounted = 0.0, False
-        return f"G92 E{file_mm:.7f}\n".encode()
+        return text + self._extruder.streams(absolute=self._absolute_e)
 
     def _file_modes(self, state: ModalState) -> bytes:
         """Return lines that restore the file's modes (except the feedrate)."""
@@ -368,19 +325,18 @@ class StreamWriter:
             parts.append(b"; stillpath: stream on\n")
             if piece.after_mark:
                 parts.append(self._jump(piece, extruder_mm))
-            parts.append(self._switching_off)
+            parts.append(self._shaper.off())
             if piece.after_mark:
                 # Klipper waits longer if it has to stand before it switches its shaper off.
                 parts.append(self._stream_commands.stand_still)
-            self._shaper_off = self._shaper_off or bool(self._switching_off)
-            self._marked, self._advances = None, False
+            self._marked = None
             self._streaming = True
         return b"".join(parts)
 
     def _jump(self, piece: Piece, extruder_mm: float) -> bytes:
         """Return lines to where a piece begins, behind an object's mark."""
         own = piece.limits_before
-        if self._shaper_off or (self._stream_commands.marks and self._switching_off):
+        if self._shaper.is_off or (self._stream_commands.marks and self._shaper.off_lines()):
             # A pause behind the line that switches it off must find the mark, too.
             own = self._stream_commands.in_stream(own)
         text = self._stream_commands.limits(own)
@@ -390,9 +346,9 @@ class StreamWriter:
     def _off(self, verbatim: VerbatimPart, extruder_mm: float) -> bytes:
         """Return lines that restore the file's state."""
         shaper, limits = self._shaper_before(verbatim), verbatim.limits_before
-        begins = self._shaper_off and self._marked is None
+        begins = self._shaper.is_off and self._marked is None
         stays = self._stream_commands.marks or isinstance(verbatim, LeftOut)
-        if begins and (stays or self._shaper_is_known):
+        if begins and (stays or self._shaper.is_known):
             self._marked, limits = limits, self._stream_commands.in_stream(limits)
         if not self._streaming:
             marking = limits is not verbatim.limits_before
@@ -406,7 +362,7 @@ class StreamWriter:
 
     def _unmarked(self) -> bytes:
         """Return lines that remove the mark of a stream once the shaper is on again."""
-        if self._marked is None or self._shaper_off:
+        if self._marked is None or self._shaper.is_off:
             return b""
         limits, self._marked = self._marked, None
         return self._stream_commands.limits(limits)
@@ -430,7 +386,7 @@ class StreamWriter:
         if self._streaming and self._behind is not None:
             text = b"" if self._at_rest else self._stream_commands.stand_still
             text += self._stream_off(*self._behind, extruder_mm, b"")
-        shaper = self._shaper_on(self._behind[0]) if self._behind is not None else b""
+        shaper = self._shaper.on(self._behind[0]) if self._behind is not None else b""
         return text + self._unmarked() + shaper
 
     def _stream_off(
@@ -438,7 +394,7 @@ class StreamWriter:
     ) -> bytes:
         self._streaming = False
         text = self._stream_commands.limits(limits) + self._file_modes(state)
-        text += self._file_extruder(extruder_mm + self._zero_mm)
+        text += self._extruder.file_again(extruder_mm + self._extruder.zero_mm)
         self._modal = None
         mark = b"; stillpath: stream off" + line_note + b"\n"
         return text + feed_line(self._file_feed_mm_min) + mark
@@ -454,40 +410,12 @@ class StreamWriter:
         # A line that sets part of the shaper must find the other parts unchanged.
         foreign = bool(np.any(np.isin(verbatim.events.kind, _MAY_SET_SHAPER)))
         aside = isinstance(verbatim, LeftOut)  # between streams again and again
-        restores = self._shaper_is_known or (
+        restores = self._shaper.is_known or (
             self._marked is not None and not self._stream_commands.marks
         )
         if foreign or (prints and not aside and restores):
-            return self._shaper_on(verbatim.limits_before)
-        return self._advance_on(verbatim.limits_before) if prints and aside else b""
-
-    @property
-    def _shaper_is_known(self) -> bool:
-        return self._stream_commands.shaper_on is not None or bool(self._file_shapers.lines)
-
-    def _advance_on(self, limits: Limits) -> bytes:
-        if not self._shaper_off or self._advances:
-            return b""
-        lines = self._stream_commands.advance_aside(limits)
-        self._advances = bool(lines)
-        return lines
-
-    def _shaper_on(self, limits: Limits) -> bytes:
-        """Return lines that set the shaper again, as far as it is known.
-
-        The next stream switches it off in any case: a pause or a macro may have set it.
-        """
-        if not self._shaper_off:
-            return b""
-        self._shaper_off = self._advances = False
-        stated, said = self._stream_commands.shaper_on, self._file_shapers.lines.values()
-        if stated is None:
-            set_again = [self._stream_commands.shaped_axes(line) for line in said]
-            self._left_off |= {"X", "Y"}.difference(*set_again)
-        lines = (stated or b"") + b"".join(said)
-        self._advance_left_off |= self._stream_commands.advance_assumed
-        advance = self._stream_commands.advance(limits)
-        return lines if lines.endswith(advance) else lines + advance
+            return self._shaper.on(verbatim.limits_before)
+        return self._shaper.advance_on(verbatim.limits_before) if prints and aside else b""
 
 
 def _held_back(line: bytes) -> bytes:

@@ -20,6 +20,7 @@ from stillpath.models.errors import ModelError
 from stillpath.models.identification.excitation import VelocityProfile, klipper_psd, regenerate
 from stillpath.models.identification.strength import strength
 from stillpath.models.identification.types import AccelerationLog, Excitation, Spectrum
+from stillpath.models.notes import WarningNote
 
 __all__ = ["AlignedLog", "align", "check_pair", "resample", "spectrum_along"]
 
@@ -139,7 +140,7 @@ def align(
         if shown is not excitation:
             again = align(log, shown, sensor_direction=sensor_direction)
             return replace(again, notes=(*again.notes, _strength_note(excitation, shown)))
-    coupling = _coupling(log, accel[kept], direction, rate_hz, excitation)
+    coupled = _coupling(log, accel[kept], direction, rate_hz, excitation)
     # Klipper begins a log with the first move; before, the machine stood still.
     lead_s = float(grid_s[0]) - (start_s - _LEAD_S)
     rest = round(lead_s * rate_hz) if 0.0 < lead_s <= _LEAD_S + _UNSURE_S else 0
@@ -152,7 +153,7 @@ def align(
         direction,
         found.correlation,
         found.excitation,
-        (*notes, coupling) if coupling else notes,
+        (*notes, *coupled),
     )
 
 
@@ -449,7 +450,7 @@ def _check_ends(
 
 def _coupling(
     log: AccelerationLog, accel: Array, direction: Array, rate_hz: float, excitation: Excitation
-) -> str:
+) -> tuple[str, ...]:
     """Return a warning if the sensor moved across the axis too, at frequencies of the test."""
     f_hz = rfftfreq(len(accel), 1.0 / rate_hz)
     swept = (f_hz >= excitation.f_start_hz) & (f_hz <= excitation.f_end_hz)
@@ -457,12 +458,13 @@ def _coupling(
     along = float(np.sum(np.abs(spectra @ direction) ** 2))
     share = float(np.sum(np.abs(spectra) ** 2)) / along - 1.0
     if share <= _CROSS:
-        return ""
-    return (
-        f"warning: across axis {log.axis} the sensor moved with {share:.0%} of the power along it: "
+        return ()
+    text = (
+        f"across axis {log.axis} the sensor moved with {share:.0%} of the power along it: "
         "the axes are coupled (CoreXY belts of unequal tension?), the frame rocks, or the sensor "
         "is loose; the model describes the motion along the axis alone"
     )
+    return (WarningNote(text),)
 
 
 def _not_found(

@@ -6,7 +6,7 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TypeAlias
+from typing import NamedTuple
 
 from pydantic import ValidationError
 
@@ -33,7 +33,7 @@ from stillpath.models.schedule import (
 )
 
 __all__ = [
-    "Tested",
+    "SpectrumRun",
     "check_labels",
     "of_one_test",
     "schedulable",
@@ -42,11 +42,16 @@ __all__ = [
     "usual",
 ]
 
-Tested: TypeAlias = tuple[Spectrum, Excitation, Condition]
-"""A spectrum, the test that made it, and under what condition."""
-
 _REPEATABLE = 0.0035
 """Relative standard deviation of a frequency from run to run: +-0.7 % within a session."""
+
+
+class SpectrumRun(NamedTuple):
+    """A spectrum, the test that made it, and under what condition."""
+
+    spectrum: Spectrum
+    test: Excitation
+    condition: Condition
 
 
 def usual(conditions: Sequence[Condition], axis: str) -> list[Condition]:
@@ -87,20 +92,23 @@ def check_labels(common: Sequence[Condition], axis: str) -> None:
         )
 
 
-def of_one_test(spectra: Sequence[Tested], axis: str) -> tuple[list[Tested], list[str]]:
+def of_one_test(spectra: Sequence[SpectrumRun], axis: str) -> tuple[list[SpectrumRun], list[str]]:
     """Leave out usual spectra except those of the most frequent test and label; say which.
 
     As responses, logs of several tests or labels are members of one set; spectra have no mean.
     """
-    common = usual([c for _, _, c in spectra], axis)
-    tests = [(e, c) for _, e, c in spectra if c in common]
+    common = usual([run.condition for run in spectra], axis)
+    tests = [(run.test, run.condition) for run in spectra if run.condition in common]
     most = max(tests, key=tests.count)
-    kept = [(s, e, c) for s, e, c in spectra if c not in common or (e, c) == most]
-    notes = [
-        f"{s.source}: not used, because spectra of different tests or labels have no mean"
-        for s, e, c in spectra
-        if c in common and (e, c) != most
-    ]
+    kept, notes = [], []
+    for run in spectra:
+        if run.condition not in common or (run.test, run.condition) == most:
+            kept.append(run)
+        else:
+            notes.append(
+                f"{run.spectrum.source}: not used, because spectra of different tests or labels "
+                "have no mean"
+            )
     return kept, notes
 
 

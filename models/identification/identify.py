@@ -8,14 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 from stillpath.models.errors import ModelError
-from stillpath.models.identification.alignment import AlignedLog, align, spectrum_along
 from stillpath.models.identification.averaging import mean_response, mean_spectrum
-from stillpath.models.identification.clocks import Lateness, lateness, timed
+from stillpath.models.identification.clocks import Lateness, timed
 from stillpath.models.identification.conditioned import (
-    Tested,
+    SpectrumRun,
     check_labels,
     of_one_test,
     scheduled,
@@ -23,33 +22,34 @@ from stillpath.models.identification.conditioned import (
     usual,
 )
 from stillpath.models.identification.conditions import Condition
-from stillpath.models.identification.estimation import (
-    estimate_aligned,
-    estimate_driven,
-    estimate_response,
-)
+from stillpath.models.identification.estimation import estimate_driven
 from stillpath.models.identification.frame import LIKELY, likely_of
-from stillpath.models.identification.friction import Friction, better_explained, dry_friction, freed
+from stillpath.models.identification.friction import Friction
 from stillpath.models.identification.messages import (
     body_notes,
-    by_file,
     fit_warnings,
     frame_mode_warnings,
     friction_notes,
     level_warnings,
     mounting_notes,
     no_frame_note,
-    parted,
     phase_fault,
     phase_warning,
     scale_warnings,
-    strength_notes,
     table_mounting_notes,
     unvaried_notes,
 )
 from stillpath.models.identification.modal_fit import refit
-from stillpath.models.identification.nozzle import Frame, frame_of
+from stillpath.models.identification.nozzle import Frame
 from stillpath.models.identification.prompt import prompt
+from stillpath.models.identification.raw_logs import (
+    RawRun,
+    estimated,
+    frame_in,
+    lateness_in,
+    spectrum_in,
+    without_friction,
+)
 from stillpath.models.identification.readers import (
     ReadSettings,
     date_in_name,
@@ -81,14 +81,14 @@ from stillpath.models.identification.types import (
     Axis,
     AxisIdentification,
     DrivenLog,
-    Excitation,
     Fit,
     FrequencyResponse,
     Measurement,
     PlantModel,
     Spectrum,
 )
-from stillpath.models.plants import ParametricMembers, PlantSetSpec, PlantSpec
+from stillpath.models.notes import by_file, parted
+from stillpath.models.plants import PlantSetSpec
 from stillpath.models.provenance import Kind, SourceFile
 
 __all__ = ["Measured", "Progress", "identify"]
@@ -96,7 +96,6 @@ __all__ = ["Measured", "Progress", "identify"]
 Progress: TypeAlias = Callable[[str, float], None]
 """Called with what is being done and how much of all is done, 0 to 1."""
 
-_SENSOR_AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 _KINDS: dict[type, Kind] = {
     AccelerationLog: "raw log",
     DrivenLog: "recorded drive",
@@ -183,8 +182,29 @@ class _Steps:
         self.say(what, self._done / self._steps)
 
 
+class _ResponseRun(NamedTuple):
+    """A response, and under what condition it was measured."""
+
+    response: FrequencyResponse
+    condition: Condition
+
+
+class _Explained(NamedTuple):
+    """Spectra of an axis, their usual conditions, and what explains those of these."""
+
+    runs: Sequence[SpectrumRun]
+    common: Sequence[Condition]
+    by: Explanations
+
+
 class _AxisWork:
-    """The identification of one axis."""
+    """The identification of one axis, in two steps: `explain_spectra`, then `identified`.
+
+    Attributes
+    ----------
+    late : list of Lateness
+        Of the raw logs that led to plants with their phase, once the axis is identified.
+    """
 
     def __init__(
         self,
@@ -197,15 +217,8 @@ class _AxisWork:
     ) -> None:
         self._axis, self._settings, self._steps = axis, settings, steps
         self._max_order = max_order
-        self._aligned: list[AlignedLog] = []
-        """Of the raw logs that are used."""
-        self._friction_mm = 0.0
-        self._earlier_s = 0.0
-        """By how much friction made alignment place the starts of the tests too late."""
+        self._explained: _Explained | None = None
         self.late: list[Lateness] = []
-        """Of the raw logs that led to plants with their phase."""
-        self._spectra: list[Tested] = []
-        self._explanations: Explanations | None = None
         kind = next(k for k in _BEST_FIRST if any(isinstance(m.measurement, k) for m in measured))
         self._used = [m for m in measured if isinstance(m.measurement, kind)]
         self._left_out = [m for m in measured if not isinstance(m.measurement, kind)]
@@ -217,14 +230,14 @@ class _AxisWork:
         )
 
     def explain_spectra(self) -> float | None:
-        """Find what explains spectra; return the frequency of what may be the frame's mode."""
+        """Find what explains spectra; return where the frame's mode may be in it, in Hz."""
         if self._kind != "spectrum":
             return None
-        self._spectra = [self._spectrum(one) for one in self._used]
+        runs = [self._spectrum(one) for one in self._used]
         if not self._settings.sensor_axis:
-            check_repeats([s for s, _, _ in self._spectra], self._axis)
-        self._explanations = self._explained()
-        return self._explanations.frame_hz
+            check_repeats([run.spectrum for run in runs], self._axis)
+        self._explained = self._explain(runs)
+        return self._explained.by.frame_hz
 
     def identified(self, frame_likely: float) -> AxisIdentification:
         """Return the axis with the notes of its files; `explain_spectra` comes first.
@@ -234,25 +247,29 @@ class _AxisWork:
         frame_likely : float
             Probability that a weak mode in spectra is the frame's.
         """
-        if self._kind == "model file":
-            found = self._from_model()
-        elif self._kind == "spectrum":
-            found = self._from_spectra(frame_likely)
-        else:
-            found = self._from_responses()
-            fault = phase_fault(found) if self._kind == "raw log" else None
-            if fault is not None:
-                self.late = []
-                found = self._from_magnitudes(fault, frame_likely)
+        match self._kind:
+            case "model file":
+                found = self._from_model()
+            case "spectrum":
+                assert self._explained is not None
+                found = self._from_spectra(self._explained, frame_likely)
+            case "raw log":
+                found = self._from_logs(frame_likely)
+            case _:
+                found = self._from_responses()
         self._steps.stepped(f"axis {self._axis}: fitted")
-        notes = [*found.notes, *friction_notes(found.plants, self._settings.guides)]
+        return self._with_notes_of_files(found)
+
+    def _with_notes_of_files(self, found: AxisIdentification) -> AxisIdentification:
+        """Add what the files say; refuse a model that they do not determine."""
         used = [one.measurement for one in self._used]
+        notes = [*found.notes, *friction_notes(found.plants, self._settings.guides)]
         notes += by_file((m.source, n) for m in used for n in m.notes)
-        for one in self._left_out:
-            notes.append(
-                f"{one.measurement.source}: not used, because a {self._kind} of axis {self._axis} "
-                "says more"
-            )
+        notes += [
+            f"{one.measurement.source}: not used, because a {self._kind} of axis {self._axis} "
+            "says more"
+            for one in self._left_out
+        ]
         notes += by_file((r.source, n) for r in found.measured for n in r.notes)
         told, warned = parted(dict.fromkeys(notes))
         names = list(dict.fromkeys(m.source for m in used))
@@ -261,6 +278,8 @@ class _AxisWork:
         if found.fit is not None:
             check_informative(found.fit, found.measured, names, warnings)
         return replace(found, notes=told, warnings=warnings)
+
+    # A model that was read
 
     def _from_model(self) -> AxisIdentification:
         if len(self._used) > 1:
@@ -274,20 +293,60 @@ class _AxisWork:
             plants = plants.model_copy(update={"provenance": about})
         return AxisIdentification(axis=self._axis, plants=plants, notes=unvaried_notes(plants))
 
+    # Responses
+
     def _from_responses(self) -> AxisIdentification:
-        responses = [(self._response(m), m.condition) for m in self._used]
-        common = usual([c for _, c in responses], self._axis)
-        # A schedule counts the modes of the plant as it was fitted.
-        frame_firm = self._settings.frame_firm or bool(special([c for _, c in responses]))
-        frame: Frame | None = None
-        if self._kind == "raw log":
-            frame = None if frame_firm else frame_of([r for r, c in responses if c in common])
-            responses = self._without_friction(responses, common, frame)
-            if self._friction_mm and not frame_firm:
-                frame = frame_of([r for r, c in responses if c in common], near=frame)
-        chosen = [r for r, c in responses if c in common]
+        """Return the axis from responses, recorded drives or measured by others."""
+        runs = [_ResponseRun(self._response(one), one.condition) for one in self._used]
+        common = usual([run.condition for run in runs], self._axis)
+        chosen = [run.response for run in runs if run.condition in common]
+        found, nominal = self._fitted(chosen, frame_firm=self._is_frame_firm(runs))
+        warnings = scale_warnings(chosen, nominal)
+        warnings += frame_mode_warnings(prompt(nominal), found.plants.nominal)
+        found = replace(found, warnings=(*found.warnings, *warnings))
+        return self._scheduled(found, nominal, runs, common)
+
+    def _from_logs(self, frame_likely: float) -> AxisIdentification:
+        """Return the axis from raw logs; by their magnitude alone where no model explains them."""
+        felt = [self._log(one) for one in self._used]
+        common = usual([run.condition for run in felt], self._axis)
+        frame_firm = self._is_frame_firm(felt)
+        frame = None if frame_firm else frame_in(felt, common)
+        runs, friction = without_friction(felt, common, frame)
+        if friction.held_mm and not frame_firm:
+            frame = frame_in(runs, common, near=frame)
+        usual_runs = [run for run in runs if run.condition in common]
+        chosen = [run.response for run in usual_runs]
         if frame is not None:
             chosen = [frame.over_bed(response) for response in chosen]
+        found, nominal = self._fitted(chosen, frame_firm=frame_firm, frame=frame)
+        plant, plants = prompt(nominal), found.plants
+        warnings = level_warnings(chosen, nominal) + frame_mode_warnings(plant, plants.nominal)
+        mounting = [] if self._settings.sensor_axis else mounting_notes(self._axis, chosen)
+        found = replace(
+            found,
+            plants=_rubbing(plants, friction),
+            warnings=(*found.warnings, *warnings),
+            notes=(*mounting, *body_notes(friction.held_mm, frame)),
+        )
+        found = self._scheduled(found, nominal, runs, common)
+        fault = phase_fault(found)
+        if fault is not None:
+            return self._from_magnitudes(runs, friction, fault, frame_likely)
+        self.late = [
+            lateness_in(run, friction, response, plant, plants)
+            for run, response in zip(usual_runs, chosen, strict=True)
+        ]
+        return found
+
+    def _is_frame_firm(self, runs: Sequence[RawRun | _ResponseRun]) -> bool:
+        # A schedule counts the modes of the plant as it was fitted.
+        return self._settings.frame_firm or bool(special([run.condition for run in runs]))
+
+    def _fitted(
+        self, chosen: Sequence[FrequencyResponse], *, frame_firm: bool, frame: Frame | None = None
+    ) -> tuple[AxisIdentification, Fit]:
+        """Return the plants of responses under the usual conditions, and the nominal fit."""
         found = response_set(
             chosen,
             axis=self._axis,
@@ -298,200 +357,118 @@ class _AxisWork:
             origin=self._origin,
             progress=self._steps.within(f"axis {self._axis}: fitting"),
         )
-        nominal = found.fit
-        assert nominal is not None
+        assert found.fit is not None
+        return found, found.fit
+
+    def _scheduled(
+        self,
+        found: AxisIdentification,
+        nominal: Fit,
+        runs: Sequence[RawRun | _ResponseRun],
+        common: Collection[Condition],
+    ) -> AxisIdentification:
+        """Return the axis with what its responses under special conditions say."""
         fits = {
-            condition: refit(mean_response([r for r, c in responses if c == condition]), nominal)
-            for condition in special([c for _, c in responses])
+            condition: refit(
+                mean_response([run.response for run in runs if run.condition == condition]), nominal
+            )
+            for condition in special([run.condition for run in runs])
         }
-        others = tuple(r for r, c in responses if c not in common)
-        notes: list[str] = []
-        if self._kind == "raw log":
-            warnings = level_warnings(chosen, nominal)
-            mounting = [] if self._settings.sensor_axis else mounting_notes(self._axis, chosen)
-            notes = [*mounting, *body_notes(self._friction_mm, frame)]
-            at = [k for k, (_, c) in enumerate(responses) if c in common]
-            self.late = self._lateness(at, chosen, prompt(nominal), found.plants)
-        else:
-            warnings = scale_warnings(chosen, nominal)
-        warnings += frame_mode_warnings(prompt(nominal), found.plants.nominal)
-        found = replace(
-            found,
-            plants=self._rubbing(found.plants),
-            measured=(*found.measured, *others),
-            warnings=(*found.warnings, *warnings),
-            notes=tuple(notes),
-        )
+        others = (run.response for run in runs if run.condition not in common)
+        found = replace(found, measured=(*found.measured, *others))
         return scheduled(found, nominal, fits, self._kind)
 
-    def _spectrum(self, one: Measured) -> Tested:
+    def _log(self, one: Measured) -> RawRun:
+        log = one.measurement
+        assert isinstance(log, AccelerationLog)
+        what = f"axis {self._axis}: {log.source}"
+        run = estimated(
+            log,
+            one.condition,
+            self._settings,
+            progress=lambda stage, part: self._steps.within(f"{what}, {stage}")(part),
+        )
+        self._steps.stepped(what)
+        return run
+
+    def _response(self, one: Measured) -> FrequencyResponse:
+        measurement, label = one.measurement, one.condition.label
+        if isinstance(measurement, DrivenLog):
+            response = estimate_driven(measurement, label=label)
+        else:
+            assert isinstance(measurement, FrequencyResponse)
+            response = replace(measurement, label=label or measurement.label)
+        self._steps.stepped(f"axis {self._axis}: {measurement.source}")
+        return response
+
+    # Spectra
+
+    def _spectrum(self, one: Measured) -> SpectrumRun:
         spectrum = one.measurement
         assert isinstance(spectrum, Spectrum)
         self._steps.stepped(f"axis {self._axis}: {spectrum.source}")
-        return spectrum, excitation_for(spectrum, self._settings), one.condition
+        return SpectrumRun(spectrum, excitation_for(spectrum, self._settings), one.condition)
 
-    def _from_spectra(self, frame_likely: float) -> AxisIdentification:
-        assert self._explanations is not None
-        spectra = self._spectra
+    def _explain(self, runs: Sequence[SpectrumRun]) -> _Explained:
+        """Find what explains the spectra without a condition of their own."""
+        common = usual([run.condition for run in runs], self._axis)
+        check_labels(common, self._axis)
+        chosen = [run for run in runs if run.condition in common]
+        by = explanations(
+            [run.spectrum for run in chosen],
+            [run.test for run in chosen],
+            column=self._settings.sensor_axis,
+            max_order=self._max_order,
+            progress=self._steps.within(f"axis {self._axis}: fitting"),
+        )
+        return _Explained(runs, common, by)
+
+    def _from_spectra(self, explained: _Explained, frame_likely: float) -> AxisIdentification:
+        runs, common = explained.runs, explained.common
+        settings, column = self._settings, self._settings.sensor_axis
         notes = [
-            (s.source, note) for s, _, _ in spectra for note in excitation_notes(s, self._settings)
+            (run.spectrum.source, note)
+            for run in runs
+            for note in excitation_notes(run.spectrum, settings)
         ]
-        if not self._settings.sensor_axis:
-            turned = self._settings.sensor_turned
-            notes += table_mounting_notes(self._axis, [s for s, _, _ in spectra], turned=turned)
-        common = usual([c for _, _, c in spectra], self._axis)
+        if not column:
+            spectra = [run.spectrum for run in runs]
+            notes += table_mounting_notes(self._axis, spectra, turned=settings.sensor_turned)
         found = spectrum_set(
-            self._explanations,
+            explained.by,
             axis=self._axis,
             frame_likely=frame_likely,
-            guides=self._settings.guides or "rails",
+            guides=settings.guides or "rails",
             origin=self._origin,
         )
         nominal = found.fit
         assert nominal is not None
         fits: dict[Condition, Fit] = {}
-        for condition in special([c for _, _, c in spectra]):
-            under = [s for s, _, c in spectra if c == condition]
-            test = same_test(under, [e for _, e, c in spectra if c == condition])
-            column = self._settings.sensor_axis
-            fits[condition] = refit_spectrum(mean_spectrum(under), test, nominal, column=column)
-        others = tuple(s for s, _, c in spectra if c not in common)
+        for condition in special([run.condition for run in runs]):
+            under = [run for run in runs if run.condition == condition]
+            spectra = [run.spectrum for run in under]
+            test = same_test(spectra, [run.test for run in under])
+            fits[condition] = refit_spectrum(mean_spectrum(spectra), test, nominal, column=column)
+        others = (run.spectrum for run in runs if run.condition not in common)
         found = replace(found, measured=(*found.measured, *others), notes=tuple(by_file(notes)))
         return scheduled(found, nominal, fits, "spectrum")
 
-    def _from_magnitudes(self, fault: str, frame_likely: float) -> AxisIdentification:
+    def _from_magnitudes(
+        self, logs: Sequence[RawRun], friction: Friction, fault: str, frame_likely: float
+    ) -> AxisIdentification:
         """Return the axis from spectra of its logs, whose phase no model explains."""
         column = self._settings.sensor_axis or self._axis
-        self._spectra = [
-            (
-                spectrum_along(aligned, log, column),
-                self._test(log, aligned),
-                one.condition,
-            )
-            for aligned, one in zip(self._aligned, self._used, strict=True)
-            if isinstance(log := one.measurement, AccelerationLog)
-        ]
-        self._spectra, left_out = of_one_test(self._spectra, self._axis)
-        self._explanations = self._explained()
-        found = self._from_spectra(frame_likely)
-        read = [note for one in self._used for note in one.measurement.notes]
+        spectra = [spectrum_in(run, self._settings, column) for run in logs]
+        spectra, left_out = of_one_test(spectra, self._axis)
+        found = self._from_spectra(self._explain(spectra), frame_likely)
+        read = [note for run in logs for note in run.log.notes]
         return replace(
             found,
-            plants=self._rubbing(found.plants),
-            notes=(*found.notes, *body_notes(self._friction_mm, None), *left_out),
+            plants=_rubbing(found.plants, friction),
+            notes=(*found.notes, *body_notes(friction.held_mm, None), *left_out),
             warnings=(*found.warnings, phase_warning(self._axis, fault, read)),
         )
 
-    def _test(self, log: AccelerationLog, aligned: AlignedLog) -> Excitation:
-        test = excitation_for(log, self._settings)
-        return replace(test, accel_per_hz_mm_s=aligned.excitation.accel_per_hz_mm_s)
 
-    def _explained(self) -> Explanations:
-        """Return what explains the spectra without a condition of their own."""
-        common = usual([c for _, _, c in self._spectra], self._axis)
-        check_labels(common, self._axis)
-        chosen = [(s, e) for s, e, c in self._spectra if c in common]
-        return explanations(
-            [s for s, _ in chosen],
-            [e for _, e in chosen],
-            column=self._settings.sensor_axis,
-            max_order=self._max_order,
-            progress=self._steps.within(f"axis {self._axis}: fitting"),
-        )
-
-    def _response(self, one: Measured) -> FrequencyResponse:
-        measurement, label = one.measurement, one.condition.label
-        what = f"axis {self._axis}: {measurement.source}"
-        if isinstance(measurement, AccelerationLog):
-            test = excitation_for(measurement, self._settings)
-            mounted = _SENSOR_AXES.get(self._settings.sensor_axis or "")
-            try:
-                known = self._settings.accel_per_hz_mm_s is not None
-                aligned = align(
-                    measurement, test, sensor_direction=mounted, is_strength_known=known
-                )
-                test = aligned.excitation
-                response = estimate_response(
-                    measurement,
-                    test,
-                    aligned=aligned,
-                    # Tests of different strength are different operating points.
-                    label=label or f"{test.accel_per_hz_mm_s:g} mm/s",
-                    progress=lambda stage, part: self._steps.within(f"{what}, {stage}")(part),
-                )
-            except ModelError as error:
-                # What the reader noticed may be the reason.
-                raise ModelError("; ".join([str(error), *measurement.notes])) from None
-            tests = excitation_notes(measurement, self._settings)
-            levels = () if known else strength_notes(response, test)
-            response = replace(response, notes=(*response.notes, *tests, *levels))
-            self._aligned.append(aligned)
-        elif isinstance(measurement, DrivenLog):
-            response = estimate_driven(measurement, label=label)
-        else:
-            assert isinstance(measurement, FrequencyResponse)
-            response = replace(measurement, label=label or measurement.label)
-        self._steps.stepped(what)
-        return response
-
-    def _without_friction(
-        self,
-        responses: Sequence[tuple[FrequencyResponse, Condition]],
-        common: Collection[Condition],
-        frame: Frame | None,
-    ) -> list[tuple[FrequencyResponse, Condition]]:
-        """Return responses corrected for dry friction, and keep its size.
-
-        Guides slide relative to the frame, but a sensor also measures the frame's motion.
-        """
-        used = [k for k, (_, c) in enumerate(responses) if c in common]
-        felt = [r for r, _ in responses]
-        motions = [felt] if frame is None else [felt, [frame.over_bed(r) for r in felt]]
-        found = dry_friction(
-            [self._aligned[k] for k in used], [[way[k] for k in used] for way in motions]
-        )
-        self._friction_mm = found.held_mm
-        if not found.held_mm:
-            return list(responses)
-        self._earlier_s = found.late_s
-        return [
-            (self._freed(k, response, motions[found.motion][k], found), condition)
-            for k, (response, condition) in enumerate(responses)
-        ]
-
-    def _freed(
-        self,
-        number: int,
-        response: FrequencyResponse,
-        motion: FrequencyResponse,
-        friction: Friction,
-    ) -> FrequencyResponse:
-        """Return the response of a log corrected for dry friction of a motion over the frame."""
-        log = self._used[number].measurement
-        assert isinstance(log, AccelerationLog)
-        sliding, stuck = (
-            estimate_aligned(log, aligned, label=response.label)
-            for aligned in freed(self._aligned[number], motion, friction)
-        )
-        return replace(better_explained(sliding, stuck), notes=response.notes)
-
-    def _lateness(
-        self,
-        numbers: Sequence[int],
-        responses: Sequence[FrequencyResponse],
-        plant: PlantSpec,
-        plants: PlantSetSpec,
-    ) -> list[Lateness]:
-        """Return how late the axis follows in each log."""
-        members = plants.members
-        others = () if isinstance(members, ParametricMembers) else [m.plant for m in members]
-        out = []
-        for number, response in zip(numbers, responses, strict=True):
-            log, aligned = self._used[number].measurement, self._aligned[number]
-            assert isinstance(log, AccelerationLog)
-            started_s = aligned.start_s - self._earlier_s
-            out.append(lateness(log, aligned.excitation, started_s, response, plant, others))
-        return out
-
-    def _rubbing(self, plants: PlantSetSpec) -> PlantSetSpec:
-        return plants.with_friction(self._friction_mm) if self._friction_mm else plants
+def _rubbing(plants: PlantSetSpec, friction: Friction) -> PlantSetSpec:
+    return plants.with_friction(friction.held_mm) if friction.held_mm else plants

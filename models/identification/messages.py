@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import numpy as np
@@ -12,7 +12,7 @@ from stillpath.models.errors import ModelError
 from stillpath.models.friction import LEAST_MM_S2, Guides
 from stillpath.models.identification.estimation import plateau_gain
 from stillpath.models.identification.nozzle import Frame
-from stillpath.models.identification.readers.checks import RANGE_ENDED
+from stillpath.models.identification.readers.checks import RangeEnded
 from stillpath.models.identification.readers.spectra import GAINS_TEXT
 from stillpath.models.identification.spectrum_model import moved_most
 from stillpath.models.identification.trust import main_mode, main_mode_known
@@ -24,12 +24,12 @@ from stillpath.models.identification.types import (
     FrequencyResponse,
     Spectrum,
 )
+from stillpath.models.notes import WarningNote, by_file
 from stillpath.models.plants import PairsSpec, PlantSetSpec, PlantSpec, RelativeModesSpec
 
 __all__ = [
     "apart_warning",
     "body_notes",
-    "by_file",
     "cross_axis_warning",
     "fit_warnings",
     "frame_mode_warnings",
@@ -37,7 +37,6 @@ __all__ = [
     "level_warnings",
     "mounting_notes",
     "no_frame_note",
-    "parted",
     "phase_fault",
     "phase_warning",
     "scale_warnings",
@@ -76,15 +75,6 @@ _BETWEEN = (
     "X nor Y"
 )
 _LEAST_POINTS, _SLOPE_TOLERANCE = 4, 0.2
-_WARNING = "warning: "
-
-
-def by_file(told: Iterable[tuple[str, str]]) -> list[str]:
-    """Group messages by their text, with the names of all files in front of it."""
-    sources: dict[str, list[str]] = {}
-    for source, text in dict.fromkeys(told):
-        sources.setdefault(text, []).append(source)
-    return [f"{', '.join(names)}: {text}" for text, names in sources.items()]
 
 
 def mounting_notes(axis: str, responses: Sequence[FrequencyResponse]) -> list[str]:
@@ -97,7 +87,7 @@ def mounting_notes(axis: str, responses: Sequence[FrequencyResponse]) -> list[st
             notes.append((response.source, _turned_text(most, axis, "log")))
         alike = [name for name, share in along.items() if share > _ALIKE]
         if len(alike) == 2:
-            notes.append((response.source, _WARNING + _BETWEEN.format(*alike)))
+            notes.append((response.source, WarningNote(_BETWEEN.format(*alike))))
     return by_file(notes)
 
 
@@ -113,9 +103,9 @@ def table_mounting_notes(
     notes = []
     for source, most, share in moved:
         if most != axis and share > _MOSTLY:
-            kind = _WARNING if most in "xy" and not turned else ""
+            kind = WarningNote if most in "xy" and not turned else str
             cause = _COPIED if (axis, most) == ("x", "y") else ""
-            notes.append((source, kind + _turned_text(most, axis, "table") + cause))
+            notes.append((source, kind(_turned_text(most, axis, "table") + cause)))
     return notes
 
 
@@ -198,14 +188,6 @@ def unvaried_notes(plants: PlantSetSpec) -> tuple[str, ...]:
     return (note,)
 
 
-def parted(told: Iterable[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Part notes from those that a reader calls a warning."""
-    told = tuple(told)
-    warned = tuple(text for text in told if _WARNING in text)
-    notes = tuple(text for text in told if text not in warned)
-    return notes, tuple(text.replace(_WARNING, "", 1) for text in warned)
-
-
 def fit_warnings(fit: Fit, sources: Sequence[str], warned: Sequence[str]) -> tuple[str, ...]:
     """Return warnings about an unreliable model; refuse a useless one, with what was `warned`."""
     if fit.magnitude_only:
@@ -256,7 +238,7 @@ def phase_fault(found: AxisIdentification) -> str | None:
 
 def phase_warning(axis: str, fault: str, notes: Sequence[str]) -> str:
     """Say why of logs with these notes only the magnitude is used."""
-    clipped = any(RANGE_ENDED in note for note in notes)
+    clipped = any(isinstance(note, RangeEnded) for note in notes)
     cause, remedy = (
         ("the sensor's range ended", "Set a larger range, or test with a lower accel_per_hz")
         if clipped
@@ -303,12 +285,12 @@ def strength_notes(response: FrequencyResponse, test: Excitation) -> tuple[str, 
     if gain is None or not as_long or not weaker < 1.0 or abs(gain / weaker - 1.0) > _AS_WEAK:
         return ()
     text = (
-        f"warning: below 15 Hz the axis moved {gain:.2f} times as much as accel_per_hz = "
+        f"below 15 Hz the axis moved {gain:.2f} times as much as accel_per_hz = "
         f"{test.accel_per_hz_mm_s:g} commands, which is Kalico's. Klipper since 2024-12 has "
         f"{usual.accel_per_hz_mm_s:g}, also with sweeping_period 0: state yours (accel_per_hz). If "
         "it is right, the axis rubs much, or the sensor's scale is off"
     )
-    return (text,)
+    return (WarningNote(text),)
 
 
 def scale_warnings(responses: Sequence[FrequencyResponse], fit: Fit) -> list[str]:

@@ -51,8 +51,8 @@ from stillpath.service.deliveries.printers import load_printers
 from stillpath.service.deliveries.sender import Sender
 from stillpath.service.jobs.store import JobStore
 from stillpath.service.jobs.task import Runner
-from stillpath.service.jobs.work import JobRunner
 from stillpath.service.jobs.worker import run_compensation
+from stillpath.service.jobs.workforce import Workforce
 from stillpath.service.security.audit import AuditLog
 from stillpath.service.security.keys import KeyStore, announce_first_key
 from stillpath.service.settings import Settings
@@ -138,7 +138,7 @@ def _prepare(state: State, settings: Settings, *, keys_required: bool) -> None:
     state.unshared = set()  # ids of jobs that only the caller who made them knows
     state.metrics = metrics.Metrics(
         lambda: state.store,
-        lambda: state.work.workers,
+        lambda: state.workforce.workers,
         lambda: state.hub.watchers,
         lambda: state.disk.free_bytes() if settings.disk_reserve_bytes else None,
     )
@@ -211,9 +211,9 @@ async def _open(app: FastAPI, settings: Settings, runner: Runner, stack: AsyncEx
     state.deliveries = Sender(engine, state.store, storage, settings, state.printers, state.checker)
     await run_in_threadpool(state.deliveries.start)
     stack.push_async_callback(run_in_threadpool, state.deliveries.stop)
-    state.work = JobRunner(settings, state.store, storage, runner=runner)
-    await run_in_threadpool(state.work.start)
-    stack.push_async_callback(run_in_threadpool, state.work.stop)
+    state.workforce = Workforce(settings, state.store, storage, runner=runner)
+    await run_in_threadpool(state.workforce.start)
+    stack.push_async_callback(run_in_threadpool, state.workforce.stop)
     state.hub = Hub(state.store)
     await state.hub.start()
     stack.push_async_callback(state.hub.stop)

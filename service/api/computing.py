@@ -155,7 +155,7 @@ async def run_and_wait(request: Request, caller: Caller, asked: ComputeRequest) 
     try:
         job: Job = await run_in_threadpool(_submit, request, asked, wanted)
         if job.id == wanted.id:
-            state.work.notify()
+            state.workforce.notify()
         else:
             state.unshared.discard(job.id)
         if not job.state.is_final:
@@ -240,7 +240,7 @@ async def _wait(request: Request, job: Job) -> None:
     except ClientDisconnect:
         if job.id in state.unshared:
             await run_in_threadpool(state.store.apply, job.id, Cancelled(time.time()))
-            state.work.notify()
+            state.workforce.notify()
         raise
 
 

@@ -80,5 +80,5 @@ def _reason(request: Request) -> tuple[str, str] | None:
     full = disk.refusal()
     if full is not None:
         return "disk", full
-    reason: str | None = request.app.state.work.not_ready_reason
+    reason: str | None = request.app.state.workforce.not_ready_reason
     return None if reason is None else ("workers", reason)

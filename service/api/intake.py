@@ -169,7 +169,7 @@ class Intake:
             )
         request.app.state.metrics.upload_bytes.inc(upload.size_bytes)
         if taken.is_new:
-            request.app.state.work.notify()
+            request.app.state.workforce.notify()
         return taken
 
     def _admit(

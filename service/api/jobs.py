@@ -220,7 +220,7 @@ async def _changed(request: Request, caller: Caller, action: str, job_id: str) -
     await run_in_threadpool(record, request, caller, action, job_id)
     hub: Hub = request.app.state.hub
     hub.nudge()
-    request.app.state.work.notify()
+    request.app.state.workforce.notify()
 
 
 async def _views(store: JobStore, jobs: Collection[Job]) -> list[JobView]:

@@ -17,7 +17,7 @@ from stillpath.models.machine import Machine
 from stillpath.service.api.access import Admin
 from stillpath.service.api.machine_views import RevisionView
 from stillpath.service.api.machines import (
-    Change,
+    Edit,
     Name,
     as_problems,
     store_revision,
@@ -86,7 +86,7 @@ async def put_settings(
     name: Name,
     caller: Admin,
     given: Annotated[_Given, Depends()],
-    change: Annotated[Change, Depends()],
+    edit: Annotated[Edit, Depends()],
 ) -> RevisionView:
     """Create a machine from a printer.cfg or M503's output; its plants are yet to be measured.
 
@@ -114,7 +114,7 @@ async def put_settings(
             response,
             name,
             caller,
-            replace(change, message=change.message or f"from {file}"),
+            replace(edit, message=edit.message or f"from {file}"),
             made,
             sources=[source_file(file, content)],
         )

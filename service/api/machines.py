@@ -36,7 +36,7 @@ from stillpath.service.security.callers import Caller
 
 __all__ = [
     "Author",
-    "Change",
+    "Edit",
     "Message",
     "Name",
     "as_problems",
@@ -78,7 +78,7 @@ router = APIRouter(prefix="/v1/machines", tags=["machines"])
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
+class Edit:
     """Who changes a machine, why, and which state of it."""
 
     author: Author = None
@@ -103,7 +103,7 @@ def store_revision(
     response: Response,
     name: str,
     caller: Caller,
-    change: Change,
+    edit: Edit,
     make: Callable[[Machine | None], Machine],
     *,
     sources: Sequence[SourceFile] = (),
@@ -118,17 +118,17 @@ def store_revision(
     Raises
     ------
     Problem
-        409 for a built-in machine, 412 or 428 as `change.if_match` demands.
+        409 for a built-in machine, 412 or 428 as `edit.if_match` demands.
     ModelError
     """
     store = _store(request)
-    expected = _expected(store, name, change.if_match)
+    expected = _expected(store, name, edit.if_match)
     machine = make(store.current(name).machine if expected else None)
     made = store.add_revision(
         name,
         machine,
-        author=change.author or caller.owner,
-        message=change.message,
+        author=edit.author or caller.owner,
+        message=edit.message,
         sources=sources,
         expected=expected,
     )
@@ -185,19 +185,19 @@ async def put_machine(
     response: Response,
     name: Name,
     caller: Admin,
-    change: Annotated[Change, Depends()],
+    edit: Annotated[Edit, Depends()],
 ) -> RevisionView:
     """Store a document as a new revision of the machine.
 
     To change an existing machine, send the ETag of the state that the change is based on as
     `If-Match`. An unchanged document makes no revision.
     """
-    await run_in_threadpool(_expected, _store(request), name, change.if_match)  # before the body
+    await run_in_threadpool(_expected, _store(request), name, edit.if_match)  # before the body
     content = await receive_document(request, max_bytes=_LARGEST_BYTES)
     with as_problems():
         machine = read_machine(content)
         return await run_in_threadpool(
-            store_revision, request, response, name, caller, change, lambda _: machine
+            store_revision, request, response, name, caller, edit, lambda _: machine
         )
 
 

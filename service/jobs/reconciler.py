@@ -16,7 +16,9 @@ import structlog
 
 from stillpath.service.database.engine import DatabaseAway
 from stillpath.service.jobs.cluster import Cluster, ClusterAway
+from stillpath.service.jobs.room import RoomForJobs
 from stillpath.service.jobs.state import START_WITHIN_S, Job, JobState, Lost
+from stillpath.service.jobs.steadiness import Steadiness
 from stillpath.service.jobs.store import JobStore
 from stillpath.service.jobs.sweep import Sweep
 from stillpath.service.settings import Settings
@@ -32,16 +34,9 @@ _LEASE, _LEASE_S, _RENEW_S = "reconciler", 5.0, 2.0
 """A lease is renewed only once it is older than `_RENEW_S`: each write waits for the disk."""
 _TICK_S = 0.5
 _SWEEP_EVERY_S = 60.0
-_MOST_REMEMBERED = 10_000
 _GIVE_BACK_S = 1.5
 """Time for a closing worker to give its job back; it checks twice a second."""
 _RETRY_S, _LONGEST_RETRY_S = 0.5, 5.0
-_NO_ROOM_S = 30.0
-"""Delay before a job whose files had no room is retried: others may need less."""
-_ROUNDING_BYTES = 1 << 20
-"""Margin for disk blocks and directory entries."""
-_CLOCK_SET_S = 1.0
-"""Difference between two checks that shows that the clock was set."""
 _OWN_GRACE_S, _GRACE_S = 60.0, 5.0
 """Time for which our own workers, which restart by themselves, and remote ones may be away before
 the service is not ready."""
@@ -62,7 +57,6 @@ class Reconciler:
         self.slots = 0
         self._settings = settings
         self._store = store
-        self._storage = storage
         self._cluster = cluster
         self._holder = uuid.uuid4().hex
         self._wake = threading.Event()
@@ -71,9 +65,8 @@ class Reconciler:
         self._sweeper = threading.Thread(target=self._run_sweeps, name="sweeper", daemon=True)
         self._log = structlog.get_logger("reconciler")
         self._disk = Disk(settings.data_dir, settings.disk_reserve_bytes)
-        self._has_room = True
-        # Attempt of a job that had no room, and time of the next try.
-        self._no_room: dict[str, tuple[int, float]] = {}
+        self._room = RoomForJobs(self._disk, storage, is_own_disk=cluster.is_own)
+        self._steady = Steadiness()
         self._in_flight: dict[str, tuple[Job, Future]] = {}
         self._broken_since: dict[str, float] = {}
         self._has_lease = False
@@ -84,9 +77,6 @@ class Reconciler:
         self._sweep = Sweep(settings, store, storage)
         self._trouble: str | None = None
         self._trouble_since = 0.0
-        # Since when database and workers have responded without interruption.
-        self._steady_since = self._looked_at = time.monotonic()
-        self._clock_offset_s = time.time() - time.monotonic()
 
     def start(self) -> None:
         """Start the threads."""
@@ -145,7 +135,7 @@ class Reconciler:
                     self._cluster.disconnect()
                 self._stopping.wait(wait_s)
                 # Count from the next try, which may be the first to work for a long time.
-                self._steady_since = time.monotonic()
+                self._steady.interrupt()
                 wait_s = min(2 * wait_s, _LONGEST_RETRY_S)
             except Exception:
                 self._log.exception("reconciler broke")
@@ -211,19 +201,13 @@ class Reconciler:
 
     def _find_silent(self) -> None:
         timeout_s = self._settings.heartbeat_timeout_s
-        now, offset_s = time.monotonic(), time.time() - time.monotonic()
-        if abs(offset_s - self._clock_offset_s) > _CLOCK_SET_S:
-            self._steady_since = now  # earlier heartbeats have times of the old clock
-        if now - self._looked_at > timeout_s / 2:
-            self._steady_since = now  # what held us up, such as a slow disk, held heartbeats up too
-        self._clock_offset_s, self._looked_at = offset_s, now
-        # Heartbeats could not arrive while the database was unreachable.
-        if now - self._steady_since > timeout_s:
-            for job in self._store.silent(time.time() - timeout_s):
-                reason = f"nothing was heard of its worker {job.worker} for {timeout_s:g} s"
-                # Our own workers end with their service: an earlier one began what we did not.
-                ended = self._cluster.is_own and job.id not in self._in_flight
-                self._give_back(job.id, job.attempt, reason, blame=not ended)
+        if self._steady.lasts_s(timeout_s / 2) <= timeout_s:
+            return
+        for job in self._store.silent(time.time() - timeout_s):
+            reason = f"nothing was heard of its worker {job.worker} for {timeout_s:g} s"
+            # Our own workers end with their service: an earlier one began what we did not.
+            ended = self._cluster.is_own and job.id not in self._in_flight
+            self._give_back(job.id, job.attempt, reason, blame=not ended)
 
     def _collect(self) -> None:
         """Drop finished futures; a job that is still running then has lost its worker.
@@ -269,7 +253,7 @@ class Reconciler:
         busy = {job.id: job for job in self._store.in_state(JobState.RUNNING)}
         busy |= {job_id: job for job_id, (job, _) in self._in_flight.items()}
         free = self.slots - len(busy)
-        if free > 0 and self._is_room():
+        if free > 0 and self._room.for_any():
             # Short jobs may use any slot; some slots are reserved for them.
             long = sum(not job.kind.is_short for job in busy.values())
             kept = min(self._settings.computing_processes, self.slots - 1)
@@ -282,8 +266,7 @@ class Reconciler:
         if most <= 0:
             return 0
         now, begun = time.monotonic(), 0
-        left_alone = [job_id for job_id, (_, until) in self._no_room.items() if until > now]
-        exclude = [*self._in_flight, *left_alone]
+        exclude = [*self._in_flight, *self._room.waiting(now)]
         skipped = 0
         while begun < most:
             # However many wait for room: those behind them may have it.
@@ -291,7 +274,7 @@ class Reconciler:
             jobs = self._store.next_queued(limit, short=short, exclude=exclude)
             for job in jobs:
                 exclude.append(job.id)
-                if job.waits_for_room and not self._may_retry_for_room(job, now):
+                if job.waits_for_room and not self._room.for_retry(job, now):
                     skipped += 1
                 elif begun < most:
                     self._in_flight[job.id] = (job, self._cluster.submit(job, self._wake.set))
@@ -299,42 +282,6 @@ class Reconciler:
             if len(jobs) < limit:
                 break
         return begun
-
-    def _is_room(self) -> bool:
-        """Return whether there is room for jobs; workers on other computers check themselves."""
-        has_room = not self._cluster.is_own or self._disk.lets_jobs_begin
-        if has_room != self._has_room:
-            self._has_room = has_room
-            free_mib = self._disk.free_bytes() >> 20
-            if has_room:
-                self._log.info("the disk has room again", free_mib=free_mib)
-            else:
-                self._log.warning("jobs wait for room on the disk", free_mib=free_mib)
-        return has_room
-
-    def _may_retry_for_room(self, job: Job, now: float) -> bool:
-        """Return whether a job whose files had no room may be tried again.
-
-        With our own workers, whose disk is known here, it waits until there is enough room.
-        """
-        attempt, until = self._no_room.get(job.id, (-1, 0.0))
-        if attempt == job.attempt and until > now:
-            return False
-        has_room = not self._cluster.is_own or self._has_room_for(job.room_bytes or 0)
-        if attempt == job.attempt and has_room:
-            return True
-        if len(self._no_room) > _MOST_REMEMBERED:
-            self._no_room.clear()
-        self._no_room[job.id] = (job.attempt, now + _NO_ROOM_S)
-        return False
-
-    def _has_room_for(self, more_bytes: int) -> bool:
-        """Return whether a job has room, on our disk and on that of the storage."""
-        room = None
-        with contextlib.suppress(StorageError):  # the workers will notice
-            room = self._storage.room()
-        stored = room is None or room.free_bytes >= more_bytes + _ROUNDING_BYTES
-        return stored and self._disk.has_room_for(more_bytes)
 
     def _give_back(self, job_id: str, attempt: int, reason: str, *, blame: bool = True) -> None:
         event = Lost(attempt, time.time(), reason, self._settings.max_attempts, blame)

@@ -158,10 +158,17 @@ def sweep_files(store: JobStore, storage: Storage, *, is_old: Callable[[str], bo
 
 
 def _delete(path: Path) -> None:
-    if path.is_dir():
-        shutil.rmtree(path, ignore_errors=True)
-    else:
-        path.unlink()
+    """Delete an abandoned upload; one that cannot be deleted must not keep the rest."""
+    try:
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink()
+    except FileNotFoundError:
+        return  # its sender has ended meanwhile
+    except OSError as error:
+        log = structlog.get_logger("sweep")
+        log.warning("an abandoned upload cannot be deleted", path=str(path), reason=str(error))
 
 
 def _dead_attempts(job: Job, files: list[Stat]) -> set[str]:

@@ -16,7 +16,7 @@ from typing import Self
 import psutil
 import structlog
 
-from stillpath.pipeline.progress import Cancelled, Progress
+from stillpath.pipeline.progress import Progress, StopWork
 from stillpath.service.database.engine import DatabaseAway
 from stillpath.service.jobs.problems import problem
 from stillpath.service.jobs.state import Event, Failed, Job, JobKind, Lost, OutOfRoom
@@ -159,19 +159,19 @@ class Watch:
 
         Raises
         ------
-        Cancelled
+        StopWork
             If the attempt has to stop, whatever the reason.
         """
         self._latest = progress
         self.check()
 
     def check(self) -> None:
-        """Raise `Cancelled` if the attempt has to stop."""
+        """Raise `StopWork` if the attempt has to stop."""
         if self._stop.is_set():
-            raise Cancelled
+            raise StopWork
 
     def pause(self, seconds: float) -> None:
-        """Sleep, but not when the attempt has to stop: then raise `Cancelled`."""
+        """Sleep, but not when the attempt has to stop: then raise `StopWork`."""
         self._stop.wait(seconds)
         self.check()
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import pytest
 
-from stillpath.pipeline.progress import Cancelled, Progress
+from stillpath.pipeline.progress import Progress, StopWork
 from stillpath.service import compiling
 from stillpath.service.compiling import STAGE, compiling_reported
 
@@ -46,9 +46,9 @@ def test_compiling_is_a_stage_and_its_time_says_nothing_of_the_time_left(monkeyp
 def test_who_stops_in_the_middle_of_a_compiler_is_heard_after_it():
     def stop(progress: Progress) -> None:
         if progress.stage == STAGE:
-            raise Cancelled
+            raise StopWork
 
     with compiling_reported(stop) as tell:
         compile_something()
-        with pytest.raises(Cancelled):
+        with pytest.raises(StopWork):
             tell(HALF)

@@ -24,7 +24,7 @@ from stillpath.models.plants import (
 from stillpath.models.reference_motion import reference_motion, reference_motion_of
 from stillpath.models.store import load_machine
 from stillpath.pipeline.caution import (
-    Choice,
+    Mixture,
     caution_for,
     choose_caution,
     design_mode,
@@ -203,7 +203,7 @@ def channel(name: str, rms_um: float) -> Channel:
 
 
 def test_what_motor_steps_or_segments_add_is_much_the_same_for_all_plants() -> None:
-    choice = Choice(
+    choice = Mixture(
         shares=(1.0, 1.0),
         worst=1.0,
         mean=0.5,

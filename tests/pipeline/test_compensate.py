@@ -31,7 +31,7 @@ from stillpath.pipeline.measuring.points import MotionSamples
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.piece_compensator import PieceCompensator, Unfit
-from stillpath.pipeline.progress import Cancelled, Progress
+from stillpath.pipeline.progress import Progress, StopWork
 from stillpath.pipeline.result import ErrorFigures, Result
 from stillpath.pipeline.simulate import plan_file
 from stillpath.simulation.measures import contour_error
@@ -221,10 +221,10 @@ def test_cancelled(tmp_path: Path, cache: Path) -> None:
     def stop(progress: Progress) -> None:
         calls.append(progress)
         if progress.stage == "compensating":
-            raise Cancelled
+            raise StopWork
 
     machine = load_machine("ender3")
-    with pytest.raises(Cancelled):
+    with pytest.raises(StopWork):
         compensate_file(source, target, machine, Options(), cache_dir=cache, progress=stop)
     assert len(calls) >= 2
     assert target.read_bytes() == b"kept"

@@ -13,7 +13,7 @@ from stillpath.gcode.errors import GcodeError
 from stillpath.models.store import load_machine
 from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.options import Options
-from stillpath.pipeline.progress import Cancelled, Progress
+from stillpath.pipeline.progress import Progress, StopWork
 from stillpath.pipeline.simulate import plan_file, simulate_file
 from tests.gcode.container_files import binary, blocks, members, package
 from tests.gcode.cutting import HEAD
@@ -91,12 +91,12 @@ def test_a_processed_file_is_refused(tmp_path: Path, cache: Path, compensated: b
 def test_unpacking_and_packing_can_be_stopped(tmp_path: Path, cache: Path, stage: str):
     def stop(progress: Progress) -> None:
         if progress.stage == stage:
-            raise Cancelled
+            raise StopWork
 
     source = tmp_path / "part.bgcode"
     source.write_bytes(binary(TEXT))
     machine = load_machine("ender3")
-    with pytest.raises(Cancelled):
+    with pytest.raises(StopWork):
         compensate_file(source, source, machine, Options(), cache_dir=cache, progress=stop)
     assert source.read_bytes() == binary(TEXT)
     assert list(tmp_path.iterdir()) == [source]

@@ -17,7 +17,7 @@ from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.live_design import cached_live_design
 from stillpath.pipeline.live_printing import simulate_live
 from stillpath.pipeline.options import Options
-from stillpath.pipeline.progress import Cancelled, Progress
+from stillpath.pipeline.progress import Progress, StopWork
 from stillpath.pipeline.result import Result
 from tests.compensating import compensated
 
@@ -162,9 +162,9 @@ def test_it_may_be_written_in_place_and_cancelled(
     def cancel(progress: Progress) -> None:
         if progress.stage == "predicting the live print":
             assert progress.fraction == 0.0
-            raise Cancelled
+            raise StopWork
 
-    with pytest.raises(Cancelled):
+    with pytest.raises(StopWork):
         compensate_file(source, source, machine, BOTH, cache_dir=cache, progress=cancel)
     assert source.read_bytes() == PENTAGON
     found = compensate_file(source, source, machine, BOTH, cache_dir=cache)

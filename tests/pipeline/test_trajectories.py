@@ -15,7 +15,7 @@ from stillpath.gcode.firmware.writing import StreamWriter
 from stillpath.models.store import load_machine
 from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.options import Options
-from stillpath.pipeline.progress import Cancelled, Progress
+from stillpath.pipeline.progress import Progress, StopWork
 from stillpath.pipeline.simulate import plan_file
 from stillpath.pipeline.trajectories import TrajectoryFormat, write_trajectories
 from stillpath.simulation.measures import contour_error
@@ -130,9 +130,9 @@ def test_an_advised_file_tells_its_progress_and_can_be_cancelled(
     def cancel(progress: Progress) -> None:
         seen.append(progress)
         if progress.fraction > 0.85:
-            raise Cancelled
+            raise StopWork
 
-    with pytest.raises(Cancelled):
+    with pytest.raises(StopWork):
         write_trajectories(
             *(source, tmp_path / "t.csv", load_machine("ender3"), Options(method="advise")),
             cache_dir=cache,

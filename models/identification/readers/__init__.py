@@ -1,12 +1,14 @@
 """Readers of measurement and model files; see `read_measurements`."""
 
+from stillpath.models.identification.readers.assumed_test import (
+    date_in_name,
+    excitation_for,
+    excitation_notes,
+)
 from stillpath.models.identification.readers.reading import read_content, read_measurements
 from stillpath.models.identification.readers.settings import (
     ReadSettings,
-    date_in_name,
     direction_of,
-    excitation_for,
-    excitation_notes,
     tested_axis,
 )
 

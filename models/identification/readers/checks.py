@@ -9,9 +9,10 @@ import numpy as np
 from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.readers.tables import Table
+from stillpath.models.notes import WarningNote
 
 __all__ = [
-    "RANGE_ENDED",
+    "RangeEnded",
     "check_alive",
     "check_long",
     "check_range",
@@ -19,9 +20,6 @@ __all__ = [
     "check_steady",
     "sensor_axes",
 ]
-
-RANGE_ENDED = "its range ended"
-"""Part of the warning, and of the refusal."""
 
 _RATES_HZ = (10.0, 1e6)
 _LONGEST_S = 3600.0
@@ -148,10 +146,16 @@ def check_alive(
     return (f"the sensor's {_listed(dead)} is constant",) if dead else ()
 
 
+class RangeEnded(WarningNote):
+    """A warning that the sensor's range ended, so that the phase of its log may tell nothing."""
+
+    __slots__ = ()
+
+
 def check_range(
     columns: dict[str, Array], source: str = "", along: Sequence[str] = ()
 ) -> tuple[str, ...]:
-    """Return a warning if a sensor's readings stop at a value that they reach often.
+    """Return a `RangeEnded` if a sensor's readings stop at a value that they reach often.
 
     An extreme is rare: where more samples lie on it than in the next part of the range, the
     sensor's own range ended there.
@@ -166,7 +170,7 @@ def check_range(
     ModelError
         If one of these often lies there, again and again: no test would tell its damping.
     """
-    found = []
+    found: list[str] = []
     for name, values in columns.items():
         for side in (1.0, -1.0):
             up = side * values
@@ -179,14 +183,14 @@ def check_range(
             unit = " mm/s^2" if name in "xyz" else ""
             text = (
                 f"the sensor's {name} stops at {side * top:.6g}{unit}, {often} samples lie "
-                f"there: {RANGE_ENDED}, and damping comes out too large; test with a lower "
+                "there: its range ended, and damping comes out too large; test with a lower "
                 "accel_per_hz, or set a larger range"
             )
             # Something that came to rest at its extreme lies there once, for long.
             times = np.count_nonzero(there[1:] & ~there[:-1])
             if name in along and often > _MOST_STOPPED * len(up) and times > _OFTEN:
                 raise ModelError(f"{source}: {text}")
-            found.append(f"warning: {text}")
+            found.append(RangeEnded(text))
     return tuple(found[:1])
 
 

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stillpath.models.arrays import Array
+from stillpath.models.notes import WarningNote
 
 __all__ = ["Restored", "restored"]
 
@@ -51,7 +52,8 @@ def restored(time_s: Array) -> Restored:
         return Restored(time_s, ())
     size = blocks.size
     regular_s = np.concatenate([[0.0], np.cumsum(blocks.gaps_s + blocks.usual_s / size)])
-    out, notes, left = time_s.copy(), [], []
+    out, left = time_s.copy(), []
+    notes: list[str] = []
     for first, following in zip(places, [*places[1:], count], strict=True):
         at_s = float(time_s[size * first] - time_s[0])
         last = first + settled
@@ -67,12 +69,13 @@ def restored(time_s: Array) -> Restored:
             "the times of those behind them were put right"
         )
     if left:
-        notes.append(
-            f"warning: the sensor lost samples at {len(left)} places, first {left[0]:.0f} s after "
+        text = (
+            f"the sensor lost samples at {len(left)} places, first {left[0]:.0f} s after "
             "the beginning of the log, and lost some again or ended too soon to put the times of "
             "those behind them right, so frequencies and damping may be wrong; measure again with "
             "less load on the sensor's board, or a lower rate of the sensor"
         )
+        notes.append(WarningNote(text))
     return Restored(out, tuple(notes))
 
 

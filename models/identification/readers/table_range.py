@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from stillpath.models.arrays import Array
 from stillpath.models.identification.types import Spectrum
+from stillpath.models.notes import WarningNote
 
 __all__ = ["end_of_test", "first_band_hz", "start_of_test"]
 
@@ -62,8 +63,8 @@ def start_of_test(spectrum: Spectrum) -> tuple[float | None, tuple[str, ...]]:
         return None, ()
     whole = 5.0 * round(start_hz / 5.0)
     start_hz = whole if abs(whole - start_hz) <= 2.0 else float(round(start_hz))
-    told = (
-        f"warning: the density rises at {start_hz:g} Hz as where a test begins, so min_freq is "
+    told = WarningNote(
+        f"the density rises at {start_hz:g} Hz as where a test begins, so min_freq is "
         f"taken to be {start_hz:g}; give min_freq if it was another"
     )
     return start_hz, (told,)
@@ -90,8 +91,8 @@ def end_of_test(
     end_hz = _early_end(spectrum, default_hz, first_band_hz(start_hz))
     if end_hz is None:
         return None, ()
-    told = (
-        f"warning: the density falls at {end_hz:g} Hz as where a test ends, so max_freq is taken "
+    told = WarningNote(
+        f"the density falls at {end_hz:g} Hz as where a test ends, so max_freq is taken "
         f"to be {end_hz:g}; give max_freq if it was another"
     )
     return end_hz, (told,)

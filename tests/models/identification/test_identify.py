@@ -15,7 +15,7 @@ from scipy.signal import hilbert
 
 from stillpath.applications.identification.run import InputFile, identify_files
 from stillpath.models.errors import ModelError
-from stillpath.models.identification.conditioned import Tested, of_one_test
+from stillpath.models.identification.conditioned import SpectrumRun, of_one_test
 from stillpath.models.identification.conditions import Condition
 from stillpath.models.identification.identify import Measured, identify
 from stillpath.models.identification.messages import (
@@ -26,6 +26,7 @@ from stillpath.models.identification.messages import (
 from stillpath.models.identification.modal_fit import fit_modes
 from stillpath.models.identification.prompt import prompt
 from stillpath.models.identification.readers import ReadSettings, read_content
+from stillpath.models.identification.readers.checks import RangeEnded
 from stillpath.models.identification.synthetic import Sensor, simulate_spectrum
 from stillpath.models.identification.trust import check_informative
 from stillpath.models.identification.types import (
@@ -39,6 +40,7 @@ from stillpath.models.identification.types import (
     PlantModel,
     Spectrum,
 )
+from stillpath.models.notes import WarningNote
 from stillpath.models.plants import (
     PairsSpec,
     PolePair,
@@ -351,7 +353,7 @@ def test_a_sensor_whose_range_ended_in_a_recorded_drive() -> None:
                 read(file)
 
 
-@pytest.mark.parametrize("notes", [(), ("warning: the sensor's x stops at 9: its range ended",)])
+@pytest.mark.parametrize("notes", [(), (RangeEnded("the sensor's x stops at 9"),)])
 def test_friction_is_not_blamed_for_a_sensor_whose_range_ended(notes: tuple[str, ...]) -> None:
     assert ("friction" in phase_warning("x", "nothing fits", notes)) is not bool(notes)
 
@@ -384,7 +386,8 @@ def test_a_belt_tested_as_an_axis(direction: tuple[float, ...], warned: bool) ->
     felt = replace(response(one_mode(40.0, 0.05)), sensor_direction=direction)
     found = [note for note in mounting_notes("x", [felt]) if "test of a belt" in note]
     assert len(found) == warned
-    assert all("warning: the sensor moved as much along its" in note for note in found)
+    assert all("the sensor moved as much along its" in note for note in found)
+    assert all(isinstance(note, WarningNote) for note in found)
 
 
 TURNED_ROUND_Z = ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
@@ -730,10 +733,10 @@ def test_spectra_of_different_labels_have_no_mean() -> None:
 def test_logs_that_become_spectra_keep_the_most_of_one_test() -> None:
     """Where no model explains the phase of raw logs of several tests."""
 
-    def tested(name: str, test: Excitation, condition: str = "") -> Tested:
+    def tested(name: str, test: Excitation, condition: str = "") -> SpectrumRun:
         (file,) = read(spectrum_file(one_mode(50.0, 0.06), QUICK, name=name))
         assert isinstance(file.measurement, Spectrum)
-        return file.measurement, test, Condition.parse(condition)
+        return SpectrumRun(file.measurement, test, Condition.parse(condition))
 
     old, new, again, loaded = (
         tested("20240101_120000", LEGACY),
@@ -742,8 +745,8 @@ def test_logs_that_become_spectra_keep_the_most_of_one_test() -> None:
         tested("20240101_140000", LEGACY, "+0.5kg"),
     )
     kept, notes = of_one_test([old, new, again, loaded], "x")
-    assert [s.source for s, _, _ in kept] == [s.source for s, _, _ in (new, again, loaded)]
-    assert [old[0].source in note for note in notes] == [True]
+    assert kept == [new, again, loaded]
+    assert [old.spectrum.source in note for note in notes] == [True]
 
 
 # Progress

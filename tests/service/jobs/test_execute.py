@@ -12,10 +12,11 @@ from typing import Any
 import pytest
 
 from stillpath.pipeline.progress import Progress
-from stillpath.service.jobs import worker
+from stillpath.service.jobs import patience
+from stillpath.service.jobs.attempt import Workplace
 from stillpath.service.jobs.state import WAITING_FOR_ROOM, Job, JobState, Lost
 from stillpath.service.jobs.watch import STUCK_EXIT_CODE
-from stillpath.service.jobs.worker import Workplace, execute
+from stillpath.service.jobs.worker import execute
 from stillpath.service.storage import StorageError
 from tests.service.jobs.site import Site, until
 from tests.service.runners import light
@@ -187,7 +188,7 @@ def test_a_storage_that_is_away_for_a_moment_is_waited_for(site: Site):
 def test_a_storage_that_stays_away_is_the_reason_in_the_end(
     site: Site, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(worker, "_PATIENCE_S", 0.0)
+    monkeypatch.setattr(patience, "_PATIENCE_S", 0.0)
     broken = _Broken(site.storage, StorageError(5, "away", "s3://b"), 99)
     job_id = site.submit("G1")
     assert Bench(site).run(job_id, storage=broken).state is JobState.QUEUED
@@ -199,7 +200,7 @@ def test_a_storage_that_stays_away_is_the_reason_in_the_end(
 
 
 def test_a_job_waits_for_a_disk_that_is_away(site: Site, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(worker, "_PATIENCE_S", 0.0)
+    monkeypatch.setattr(patience, "_PATIENCE_S", 0.0)
     job_id = site.submit("G1")
     (site.data_dir / ".fresh").rename(site.data_dir / ".away")
     for _ in range(3):

@@ -11,10 +11,11 @@ from typing import Any
 import pytest
 
 from stillpath.service.database.engine import DatabaseAway
-from stillpath.service.jobs import reconciler
+from stillpath.service.jobs import reconciler, room
+from stillpath.service.jobs.attempt import Workplace
 from stillpath.service.jobs.reconciler import Reconciler
 from stillpath.service.jobs.state import WAITING_FOR_ROOM, Claimed, Job, JobState, Lost, OutOfRoom
-from stillpath.service.jobs.worker import Workplace, execute
+from stillpath.service.jobs.worker import execute
 from tests.service.jobs.site import Site
 from tests.service.runners import light
 from tests.service.small_disk import small_disk
@@ -95,7 +96,7 @@ def test_a_service_that_was_killed_is_no_loss_of_its_jobs(site: Site, own: bool,
     site.store.apply(job_id, Claimed(time.time() - 3600.0, "w"))
     if not ours:
         look._forget()
-    look._steady_since -= 3600.0
+    look._steady._since_s -= 3600.0
     look._tick()
     job = site.get(job_id)
     assert (job.state, job.losses) == (JobState.QUEUED, int(ours or not own))
@@ -108,7 +109,7 @@ def test_a_disk_that_held_everybody_up_is_no_silence(site: Site, monkeypatch: py
     look._tick()
     job_id = site.submit("G1")
     site.store.apply(job_id, Claimed(time.time(), "w"))
-    look._steady_since -= 3600.0
+    look._steady._since_s -= 3600.0
     look._leased_at -= 3600.0
 
     def slow(*_: object) -> bool:
@@ -119,7 +120,7 @@ def test_a_disk_that_held_everybody_up_is_no_silence(site: Site, monkeypatch: py
         disk.setattr(site.store, "lease", slow)
         look._tick()
     assert site.get(job_id).state is JobState.RUNNING
-    look._steady_since -= 3600.0  # and still no heartbeat
+    look._steady._since_s -= 3600.0  # and still no heartbeat
     look._tick()
     assert site.get(job_id).state is JobState.QUEUED
 
@@ -184,7 +185,7 @@ def test_jobs_that_wait_for_room_let_others_pass(site: Site):
 def test_a_job_waits_until_the_disk_of_the_storage_has_room(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(reconciler, "_NO_ROOM_S", 0.0)
+    monkeypatch.setattr(room, "_NO_ROOM_S", 0.0)
     with small_disk(tmp_path / "disk", 12) as disk:
         site = Site(tmp_path / "data", storage_url=(disk / "store").as_uri())
         place = Workplace(site.settings, site.store, site.storage, site.data_dir / "scratch")

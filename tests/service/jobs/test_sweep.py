@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import time
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -94,6 +97,30 @@ def test_old_jobs_are_forgotten_with_their_files(site: Site, sweep: Sweep, clock
     clock.sweep(sweep, 2)
     assert site.store.get(old) is None
     assert keys(site) == {f"jobs/{young}/source/part.gcode"}
+
+
+@pytest.mark.parametrize("refused", ["unlink", "rmdir"])
+def test_an_upload_that_cannot_be_deleted_keeps_no_old_job(
+    site: Site, sweep: Sweep, clock: Clock, monkeypatch: pytest.MonkeyPatch, refused: str
+):
+    """It belongs to somebody else, or another program has it open (Windows)."""
+    old = site.submit("G1")
+    site.store.apply(old, Cancelled(time.time()))
+    folder = site.data_dir / "incoming"
+    (folder / "measurements-1").mkdir(parents=True)
+    (folder / "upload").write_text("x")
+    sweep.run()
+    original = getattr(os, refused)
+
+    def fails(path: Any, **more: Any) -> None:
+        if "incoming" in str(path) or path in ("measurements-1", "upload"):
+            raise PermissionError(errno.EPERM, "Operation not permitted", str(path))
+        original(path, **more)
+
+    monkeypatch.setattr(os, refused, fails)
+    clock.sweep(sweep, 26)
+    assert site.store.get(old) is None
+    assert len(list(folder.iterdir())) == 1
 
 
 @pytest.mark.parametrize("days", [32, -1, 400])

@@ -8,7 +8,7 @@ if __name__ == "__main__":
     from stillpath.service.database.engine import open_database
     from stillpath.service.environment import prepare_environment
     from stillpath.service.jobs.store import JobStore
-    from stillpath.service.jobs.work import JobRunner
+    from stillpath.service.jobs.workforce import Workforce
     from stillpath.service.logs import configure_logging
     from stillpath.service.settings import Settings
     from stillpath.service.storage.factory import open_storage
@@ -19,7 +19,7 @@ if __name__ == "__main__":
     configure_logging()
     settings = Settings()
     engine = open_database(settings)
-    work = JobRunner(
+    work = Workforce(
         settings, JobStore(engine), open_storage(settings), getattr(runners, sys.argv[1])
     )
     ended = threading.Event()

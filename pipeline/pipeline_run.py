@@ -74,7 +74,7 @@ from stillpath.pipeline.verifying import Verifier
 if TYPE_CHECKING:
     from _typeshed import SupportsWrite
 
-__all__ = ["COMPENSATED", "Attempt", "Job"]
+__all__ = ["COMPENSATED", "Attempt", "PipelineRun"]
 
 _EXPLAINED = (Unfit, GcodeError, DesignError, ModelError)
 """Errors whose message tells the user why a piece cannot be compensated."""
@@ -97,7 +97,7 @@ class Attempt:
     motion: MotionSamples
 
 
-class Job:
+class PipelineRun:
     """One run of the pipeline over one file.
 
     The text stays in `target` until its times are known; `retiming` then copies it.
@@ -211,7 +211,7 @@ class Job:
         """Delay of the written file against the original at the current place."""
         return self._sum.time_s - self._sum.original_s
 
-    def run(self, name: str, facts: SlicerFacts) -> Result:
+    def write(self, name: str, facts: SlicerFacts) -> Result:
         """Write the file except for its times, and return the figures measured on it.
 
         Raises
@@ -367,7 +367,7 @@ class Job:
         piece, paced : Piece
             As sliced, and as planned at the new pace.
         """
-        writer, checker = copy.copy(self._writer), None
+        writer, checker = self._writer.snapshot(), None
         try:
             with self._clock.stage("compensate"):
                 made = self._designed.compensate(paced, self._point)

@@ -1,4 +1,4 @@
-"""The API's interface to all job processing: start, stop, status."""
+"""Those who get jobs done, as the API sees them: start, stop, status."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from stillpath.service.jobs.worker import run_compensation
 from stillpath.service.settings import Settings
 from stillpath.service.storage import Storage
 
-__all__ = ["JobRunner"]
+__all__ = ["Workforce"]
 
 
-class JobRunner:
-    """Gets the jobs of a store done.
+class Workforce:
+    """The workers of a service, and the reconciler that gives them the jobs of a store.
 
     Parameters
     ----------
