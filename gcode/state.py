@@ -98,6 +98,8 @@ class MachineState:
         The first one of an unknown name, and its line.
     warnings : dict of str to int
         What the firmware skips or what is unknown, with the line of first occurrence.
+    notes : dict of str to int
+        The same of what only some printers of this kind do not skip.
     """
 
     def __init__(self, machine: Machine, dialect: Dialect, limits: Limits, *, strict: bool) -> None:
@@ -125,14 +127,14 @@ class MachineState:
         self.tool_known = dialect.tool_at_start
         self.conditional_indent = -1
         self.warnings: dict[str, int] = {}
+        self.notes: dict[str, int] = {}
         self.layer_style: str | None = None
         self.carry_out: Callable[[Command], int] = nobody
         self.buffer = np.zeros(0, np.uint8)
         self.span = (0, 0)
         self.remembers = True
         """The line in hand is one command (`remember`)."""
-        self.memos = 0
-        self.memo_limits = 0
+        self.memos = self.memo_limits = 0
 
         self.f = f = np.zeros(at.F_SIZE)
         self.i = i = np.zeros(at.I_SIZE, np.int64)
@@ -356,8 +358,15 @@ class MachineState:
 
     def warn(self, message: str) -> None:
         """Record a warning with the first line at which it occurs."""
-        if len(self.warnings) < 100:
-            self.warnings.setdefault(message, int(self.i[at.I_LINE]))
+        self._record(self.warnings, message)
+
+    def note(self, message: str) -> None:
+        """Record a note with the first line at which it occurs."""
+        self._record(self.notes, message)
+
+    def _record(self, found: dict[str, int], message: str) -> None:
+        if len(found) < 100:
+            found.setdefault(message, int(self.i[at.I_LINE]))
 
     def change_retraction(self, **changes: float) -> None:
         """Change what G10 and G11 do."""

@@ -45,6 +45,7 @@ _ADDED: dict[tuple[str, ...], dict[str, Any]] = {
         "ft_motion": False,
         "ft_motion_version": 2,
         "macros": [],
+        "macros_known": False,
         "arc_circles": False,
         "limits_capped": False,
     },

@@ -20,7 +20,7 @@ from stillpath.pipeline.operating_point import Operation
 from stillpath.pipeline.options import COARSE_UM, Options
 from stillpath.pipeline.pacing.budget import SpeedBudget
 from stillpath.pipeline.pacing.budget_measure import BudgetMeasurement
-from stillpath.pipeline.reading import passed_over
+from stillpath.pipeline.reading import passed_over, perhaps_passed_over
 from stillpath.pipeline.result import Channel, Result
 from stillpath.pipeline.selection import Selection
 from stillpath.pipeline.totals import Totals
@@ -135,6 +135,7 @@ class Summary:
         if self.choice is not None and any(self.choice.shares):
             yield prediction_note(self.machine, self.choice)
         yield from self.operation.notes()
+        yield from perhaps_passed_over(self.reader)
         if self.writer is not None:
             yield from self._macro_with_limits()
             yield from self.totals.left_out_notes(self.options.where)

@@ -200,6 +200,8 @@ def machine_from_config(config: PrinterConfig, stated: StatedMachine) -> Machine
     }
     for fact in found:
         _put(document, fact)
+    # No fact, so that machines from before this was noted do not differ from their printers.
+    document.setdefault("firmware", {})["macros_known"] = not config.includes
     try:
         machine = Machine.model_validate(document)
     except ValidationError as error:

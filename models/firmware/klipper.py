@@ -102,7 +102,8 @@ class Klipper(FirmwareFacts):
     """Configured macros with the name of another firmware's word, such as M205 or M900: they may do
     anything. M205 also sets the corner velocity; M204 is named where it sets ACCEL_TO_DECEL to
     half of its acceleration, too, as QIDI's does."""
-
+    macros_known: bool = False
+    """There are no other such macros: printer.cfg was read with all files that it includes."""
     limits_capped: bool = False
     """SET_VELOCITY_LIMIT and M204 set no speed and no acceleration above those of `planner`, as on
     Elegoo's Centauri Carbon."""

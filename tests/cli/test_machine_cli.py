@@ -292,6 +292,7 @@ def test_a_machine_from_a_printer_cfg(store: MachineStore, config: Path, capsys)
     assert machine.pressure_advance_s == 0.04
     assert machine.firmware.arc_resolution_mm == 0.1
     assert machine.firmware.macros == ("M900",)
+    assert not machine.firmware.macros_known  # of mainsail.cfg
     shaper = machine.firmware.shaper
     assert shaper is not None
     assert (shaper.type_x, shaper.freq_x_hz, shaper.type_y) == ("ei", 61.2, "2hump_ei")
@@ -542,6 +543,11 @@ def test_included_files_are_read_as_klipper_reads_them(store: MachineStore, tmp_
     assert "note: [include" not in capsys.readouterr().out
     made = store.current("mine")
     assert made.machine.firmware.macros == ("M205", "M900")
+    assert made.machine.firmware.macros_known
+    # Machines from before that was noted do not differ, and keep their revision.
+    before = made.machine.firmware.model_copy(update={"macros_known": False})
+    machine = made.machine.model_copy(update={"firmware": before})
+    assert differences(machine, read_printer_config(config)) == []
     planner, travel = made.machine.firmware.planner, made.machine.travel
     assert (planner.max_accel_mm_s2, planner.max_velocity_mm_s) == (4000.0, 250.0)
     assert made.machine.firmware.arc_resolution_mm == 0.1

@@ -729,10 +729,19 @@ def test_a_word_that_printers_have_as_a_macro_is_told(read) -> None:
     text = "M205 X8\nG1 X5 Y5 F600\nM205 X500\nG1 X9\nM205 X50\n"  # the first one at the start
     block, interpreter = read(text, "klipper", homed_at_start=False)
     assert block.events.kind.tolist() == [EventKind.HARMLESS] * 3
-    (said,) = interpreter.warnings
-    assert said.startswith("line 3: M205 in the middle of the print")
-    named = ({"macros": ("M205",)}, {"harmless_macros": ("M205",)}, {"unknown_commands": "skip"})
-    assert all(read(text, "klipper", **fields)[1].warnings == [] for fields in named)
+    ((said, line),) = interpreter.state.notes.items()
+    assert (line, interpreter.warnings) == (3, [])
+    assert said.startswith("M205 in the middle of the print")
+    for fields in (
+        {"macros": ("M205",)},
+        {"harmless_macros": ("M205",)},
+        {"unknown_commands": "skip"},
+        {"macros_known": True},
+    ):
+        assert read(text, "klipper", **fields)[1].state.notes == {}
+    # It may be a command, of which printer.cfg says nothing.
+    advance = text.replace("M205 X", "M900 K")
+    assert len(read(advance, "klipper", macros_known=True)[1].state.notes) == 1
 
 
 @pytest.mark.parametrize(

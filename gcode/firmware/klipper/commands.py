@@ -14,6 +14,7 @@ from stillpath.gcode import _slots as at
 from stillpath.gcode.lexer import Command
 from stillpath.gcode.state import MachineState, Saved
 from stillpath.gcode.types import EventKind
+from stillpath.models.firmware import Klipper
 
 __all__ = [
     "acceleration",
@@ -45,6 +46,8 @@ _LIMITS: dict[str, tuple[str, Callable[[float], bool], str]] = {
 """Parameters of SET_VELOCITY_LIMIT: what they set, which values are allowed, and that in words."""
 _CAPPED = ("velocity_mm_s", "accel_mm_s2")
 _MOST_STATES = 1000
+_COMMANDS = ("M593", "M900")
+"""Words of other firmwares that some forks have as commands, of which printer.cfg says nothing."""
 
 
 def velocity_limit(state: MachineState, command: Command, *, capped: bool = False) -> int:
@@ -73,13 +76,18 @@ def velocity_limit(state: MachineState, command: Command, *, capped: bool = Fals
 def perhaps_macro(state: MachineState, command: Command) -> int:
     """Another firmware's word, which Klipper passes over; many printers have a macro for it.
 
+    Where the macros are known it is none, but M900 may be a command.
+
     Creality's M205 sets the corner velocity, their M900 pressure advance, and the M300 of Klipper's
     own examples waits (CrealityOfficial/K1_Series_Klipper, config/*/gcode_macro.cfg, 2024;
     Klipper3d/klipper, config/printer-sunlu-t3-2022.cfg, 2026-08). Anycubic's and Elegoo's Klippers
-    have M900 as a command (ANYCUBIC-3D/Kobra3, elegooofficial/CentauriCarbon, 2025).
+    have M900 as a command, Elegoo's M593 too (ANYCUBIC-3D/Kobra3, elegooofficial/CentauriCarbon,
+    2025).
     """
-    if state.i[at.I_KNOWN] & 3 == 3 and state.firmware.unknown_commands != "skip":
-        state.warn(
+    facts = state.firmware
+    known = isinstance(facts, Klipper) and facts.macros_known and command.name not in _COMMANDS
+    if state.i[at.I_KNOWN] & 3 == 3 and facts.unknown_commands != "skip" and not known:
+        state.note(
             f"{command.name} in the middle of the print: Klipper passes over it, but if yours has "
             "a macro or a command of that name, as many makers' printers have, it sets limits or "
             f"waits in the middle of a stream; put {command.name} among the machine's macros "
