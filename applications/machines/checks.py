@@ -433,6 +433,8 @@ def _word(value: Any) -> str:
             return "on" if value else "off"
         case float():
             return f"{value:g}"
+        case list() | tuple():
+            return ", ".join(map(str, value)) or "none"
         case dict():
             return ", ".join(f"{key} {_word(entry)}" for key, entry in value.items())
         case _:

@@ -257,8 +257,6 @@ def _printer(config: PrinterConfig) -> list[Fact]:
     else:
         ratio = config.number(section, option, ratio)
     planner, options = "firmware.planner", config.sections[section]
-    # Klippers that take this option are from before 2025-09, when these commands stop the head.
-    stopping = ["SET_PRESSURE_ADVANCE", *(["M900"] if _CAPS in options else [])]
     older = f"{planner}.max_accel_to_decel_mm_s2"
     return [
         Fact(section, "kinematics", "kinematics", config.text(section, "kinematics")),
@@ -266,7 +264,6 @@ def _printer(config: PrinterConfig) -> list[Fact]:
         Fact(section, "max_accel", f"{planner}.max_accel_mm_s2", accel),
         Fact(section, option, f"{planner}.minimum_cruise_ratio", ratio),
         *([Fact(section, option, older, to_decel)] if to_decel else []),
-        *([Fact(section, option, "firmware.stopping_macros", stopping)] if to_decel else []),
         *_numbers(
             config,
             section,
@@ -275,7 +272,14 @@ def _printer(config: PrinterConfig) -> list[Fact]:
             ("max_z_accel", f"{planner}.max_z_accel_mm_s2", accel),
         ),
         # Only a firmware that has this option is known to cap what a file sets.
-        *(Fact(section, name, "firmware.limits_capped", True) for name in {_CAPS} & options.keys()),
+        *(
+            Fact(section, _CAPS, place, value)
+            for place, value in (
+                ("firmware.limits_capped", True),
+                ("firmware.stopping_macros", ["M900"]),
+            )
+            if _CAPS in options
+        ),
     ]
 
 
