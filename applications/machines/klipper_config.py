@@ -39,6 +39,9 @@ _SECTION = re.compile(r"\[(?P<name>[^]]+)\]\s*$")
 _OPTION = re.compile(r"(?P<name>[^\s:=][^:=]*)[:=]\s*(?P<value>.*)$")
 _HALVES = re.compile(r"ACCEL_TO_DECEL=\{[^{}\n]*/\s*2(\.0*)?\s*\}")
 """In M204 of QIDI's printers (QIDITECH, gcode_macro.cfg, 2023 to 2025)."""
+_LIMIT_MACROS = {"M203": "VELOCITY", "M205": "SQUARE_CORNER_VELOCITY"}
+"""Macros that makers have for Cura's files, and what they set."""
+_STATEMENT, _EXPRESSION = re.compile(r"\{%.*?%\}", re.DOTALL), re.compile(r"\{[^{}]*\}")
 _COMMENT = re.compile(r"#.*$|(?:^|\s);.*$")
 
 
@@ -412,13 +415,27 @@ def _macros(config: PrinterConfig) -> list[Fact]:
         section.partition("gcode_macro ")[2].strip().upper(): options
         for section, options in config.sections.items()
     }
-    macros = sorted(named.keys() & FOREIGN.keys())
+    limits = [name for name in _LIMIT_MACROS if name in named and _only_limits(name, named[name])]
+    macros = sorted(named.keys() & FOREIGN.keys() - set(limits))
     body = named.get("M204", {}).get("gcode")
     if body is not None and _HALVES.search(body.value):
         macros = sorted([*macros, "M204"])
-    if not macros and config.includes:
-        return []
-    return [Fact("gcode_macro", "", "firmware.macros", macros)]
+    found = (("firmware.macros", macros), ("firmware.limit_macros", limits))
+    return [
+        Fact("gcode_macro", "", place, names)
+        for place, names in found
+        if names or not config.includes
+    ]
+
+
+def _only_limits(name: str, options: dict[str, Option]) -> bool:
+    """Return whether a macro sets its limit from X and Y as they are, and does nothing else."""
+    body = options["gcode"].value if "gcode" in options else ""
+    if not body or len(body) >= _LONGEST_MACRO or re.search(r"[*/+]", body):
+        return False
+    line = re.compile(rf"SET_VELOCITY_LIMIT(\s+{_LIMIT_MACROS[name]}=(\{{}}|\"\{{}}\"))?\s*")
+    plain = _EXPRESSION.sub("{}", _STATEMENT.sub("", body))
+    return all(line.fullmatch(row) for row in plain.split("\n") if row.strip())
 
 
 def _elsewhere(includes: tuple[str, ...]) -> str:

@@ -100,10 +100,13 @@ class Klipper(FirmwareFacts):
     """None: unknown. It is switched off for our moves and stays off, and the report says so."""
     macros: tuple[str, ...] = ()
     """Configured macros with the name of another firmware's word, such as M205 or M900: they may do
-    anything. M205 also sets the corner velocity; M204 is named where it sets ACCEL_TO_DECEL to
-    half of its acceleration, too, as QIDI's does."""
+    anything. M203 and M205 also set what `limit_macros` says; M204 is named where it sets
+    ACCEL_TO_DECEL to half of its acceleration, too, as QIDI's does."""
     macros_known: bool = False
     """There are no other such macros: printer.cfg was read with all files that it includes."""
+    limit_macros: tuple[Literal["M203", "M205"], ...] = ()
+    """Such macros that do no more than set a limit, and are not among `macros`: M203 the speed (the
+    smaller of X and Y), M205 the corner velocity (X, or else Y)."""
     limits_capped: bool = False
     """SET_VELOCITY_LIMIT and M204 set no speed and no acceleration above those of `planner`, as on
     Elegoo's Centauri Carbon."""

@@ -575,6 +575,55 @@ def test_a_macro_m204_that_halves(store: MachineStore, config: Path, line: str, 
     assert store.current("mine").machine.firmware.macros == macros
 
 
+CORNER_OR = """
+  {% if 'X' in params %}
+    SET_VELOCITY_LIMIT SQUARE_CORNER_VELOCITY={params.X}
+  {% elif 'Y' in params %}
+    SET_VELOCITY_LIMIT SQUARE_CORNER_VELOCITY={params.Y}
+  {% endif %}
+"""
+CORNER_MIN = """
+  {% if 'X' in params or 'Y' in params %}
+    SET_VELOCITY_LIMIT SQUARE_CORNER_VELOCITY="{
+      (params.X|default(0)|float, params.Y|default(0)|float)|min}"
+  {% else %}
+    SET_VELOCITY_LIMIT
+  {% endif %}
+"""
+SPEED = """
+    {% set velocity = (params.X|default(params.Y)|float,
+                       params.Y|default(params.X)|float)|min %}
+    SET_VELOCITY_LIMIT VELOCITY="{velocity}"
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "body", "only"),
+    [
+        ("M205", CORNER_OR, True),
+        ("M205", CORNER_MIN, True),
+        ("M203", SPEED, True),
+        ("M203", CORNER_OR, False),
+        ("M205", CORNER_OR + "    M400\n", False),
+        ("M205", CORNER_OR.replace("params.X}", "params.X|float / 2}"), False),
+        ("M205", CORNER_OR + "    # long\n    SET_VELOCITY_LIMIT\n" * 250, False),
+        ("M205", " M400", False),
+    ],
+)
+def test_a_macro_that_only_sets_a_limit(
+    store: MachineStore, config: Path, name: str, body: str, only: bool
+):
+    """Creality's and Elegoo's: streams need not end before it."""
+    config.write_text(f"[gcode_macro {name}]\ndescription: a\ngcode:{body}\n{CONFIG}")
+    assert machines("from-config", config, "--name", "mine") == 0
+    machine = store.current("mine").machine
+    firmware = machine.firmware
+    assert firmware.kind == "klipper"
+    limits, macros = firmware.limit_macros, firmware.macros
+    assert (limits, macros) == (((name,), ("M900",)) if only else ((), (name, "M900")))
+    assert differences(machine, read_printer_config(config)) == []
+
+
 def test_a_configuration_that_includes_itself(tmp_path: Path, capsys):
     file = tmp_path / "printer.cfg"
     file.write_text("[include a.cfg]\n")

@@ -19,9 +19,9 @@ from stillpath.models.firmware import Klipper
 __all__ = [
     "acceleration",
     "activate_extruder",
-    "corner_macro",
     "exclude_object",
     "gcode_offset",
+    "limit_macro",
     "perhaps_macro",
     "reset_velocity_limit",
     "restore_state",
@@ -96,18 +96,24 @@ def perhaps_macro(state: MachineState, command: Command) -> int:
     return state.event(EventKind.HARMLESS)
 
 
-def corner_macro(state: MachineState, command: Command) -> int:
-    """M205 where the machine names a macro of it: the corner velocity becomes X, or else Y.
+def limit_macro(state: MachineState, command: Command, *, kind: EventKind) -> int:
+    """M203 and M205 where the machine names a macro of it: the speed, and the corner velocity.
 
-    So do all of 79 printers' that were looked at (Creality's K1, K2 and Ender-3 V3, Elegoo's
-    Neptune 4, Klippain; 2023 to 2026). As any macro it may do more.
+    M203 sets the smaller of X and Y, M205 X, or else Y. So do all of 79 printers' that were looked
+    at (Creality's K1, K2 and Ender-3 V3, Elegoo's Neptune 4, Klippain; 2023 to 2026), and no more.
+    One whose body is not known (kind UNKNOWN) may do more, as any macro.
     """
     given = state.numbers(command, "XY")
-    corner_mm_s = given.get("X", given.get("Y", -1.0))
-    values = {"square_corner_velocity_mm_s": corner_mm_s} if corner_mm_s >= 0.0 else {}
-    state.settle()
-    state.macro_ran = True
-    return state.set_limits(command, values, kind=EventKind.UNKNOWN)
+    values = {}
+    if command.name == "M203":
+        speed_mm_s = min(given.values(), default=0.0)
+        values = {"velocity_mm_s": speed_mm_s} if speed_mm_s > 0.0 else {}
+    elif (corner_mm_s := given.get("X", given.get("Y", -1.0))) >= 0.0:
+        values = {"square_corner_velocity_mm_s": corner_mm_s}
+    if kind == EventKind.UNKNOWN:
+        state.settle()
+        state.macro_ran = True
+    return state.set_limits(command, values, kind=kind)
 
 
 def reset_velocity_limit(state: MachineState, _command: Command) -> int:
