@@ -102,6 +102,8 @@ class MachineState:
         The same of what only some printers of this kind do not skip.
     """
 
+    _passed_on = 0
+
     def __init__(self, machine: Machine, dialect: Dialect, limits: Limits, *, strict: bool) -> None:
         self.machine = machine
         self.firmware: FirmwareFacts = machine.firmware
@@ -173,6 +175,11 @@ class MachineState:
         copies = {name: table.copy() for name, table in self.tables._asdict().items()}
         other.tables = Tables(**copies)
         return other
+
+    @property
+    def moves(self) -> int:
+        """Number of moves so far."""
+        return self._passed_on + int(self.i[at.I_MOVES])
 
     # What a line does
 
@@ -377,6 +384,7 @@ class MachineState:
 
     def allocate(self, count: int) -> None:
         """Allocate new rows; the previous ones have been passed on."""
+        self._passed_on = self.moves
         self.rows = Rows.empty(count)
         i = self.i
         i[at.I_MOVES] = i[at.I_EVENTS] = i[at.I_FILLED_MOVES] = i[at.I_FILLED_EVENTS] = 0

@@ -2,7 +2,8 @@
 
 Steps are generated ahead of their motion, by the look-ahead of input shaper and pressure advance.
 SET_INPUT_SHAPER flushes them all: the next move starts later by the look-ahead before the command
-plus that after it. So does a SET_PRESSURE_ADVANCE that changes the time over which the extruder's
+plus that after it; behind several commands at one rest, by the longest before any of them plus that
+after the last. So does a SET_PRESSURE_ADVANCE that changes the time over which the extruder's
 speed is averaged, which is 0 without pressure advance. Klipper before 2025-09-03, and Kalico, flush
 for every SET_PRESSURE_ADVANCE: their machines name it among their ``stopping_macros``, or have a
 ``max_accel_to_decel_mm_s2``, which only a Klipper before 2024-03 has.
@@ -51,7 +52,7 @@ def pressure_advance(state: MachineState, command: Command) -> int:
         found = _EXTRUDER.fullmatch(given["EXTRUDER"])
         if found is None:
             # An [extruder_stepper]'s may change or not.
-            return state.event(EventKind.STOP, 2.0 * before_s)
+            return _flush(state, EventKind.STOP, before_s)
         extruder = int(found[1] or 0)
     smooth_s = _extruder_smooth_s(state, extruder)
     again = f"ADVANCE {extruder}" in state.factors
@@ -62,7 +63,7 @@ def pressure_advance(state: MachineState, command: Command) -> int:
         if again and state.i[at.I_KNOWN] & 3 == 3:
             state.warn(_MAY_STOP)
         return state.event(EventKind.HARMLESS)
-    return state.event(EventKind.STOP, before_s + _ahead_s(state))
+    return _flush(state, EventKind.STOP, before_s)
 
 
 def shaper(state: MachineState, command: Command) -> int:
@@ -79,7 +80,20 @@ def shaper(state: MachineState, command: Command) -> int:
         state.factors[f"shaper {axis}"] = float(_KINDS.index(_modelled(kind)))
         state.factors[f"f_hz {axis}"] = f_hz
         state.factors[f"damping {axis}"] = damping
-    return state.event(EventKind.SHAPER, before_s + _ahead_s(state))
+    return _flush(state, EventKind.SHAPER, before_s)
+
+
+def _flush(state: MachineState, kind: EventKind, before_s: float) -> int:
+    """Write an event that stands for the look-ahead, less what was counted at this rest."""
+    known = state.factors
+    # A macro may have moved.
+    place, counted_s = state.moves + int(state.i[at.I_MACROS]), 0.0
+    if known.get("flushed at") == place:
+        before_s = max(before_s, known["flushed before"])
+        counted_s = known["flushed for"]
+    stands_s = max(before_s + _ahead_s(state), counted_s)
+    known |= {"flushed at": place, "flushed before": before_s, "flushed for": stands_s}
+    return state.event(kind, stands_s - counted_s)
 
 
 def _always_stops(state: MachineState, command: Command) -> bool:
