@@ -42,6 +42,9 @@ _HALVES = re.compile(r"ACCEL_TO_DECEL=\{[^{}\n]*/\s*2(\.0*)?\s*\}")
 _LIMIT_MACROS = {"M203": "VELOCITY", "M205": "SQUARE_CORNER_VELOCITY"}
 """Macros that makers have for Cura's files, and what they set."""
 _STATEMENT, _EXPRESSION = re.compile(r"\{%.*?%\}", re.DOTALL), re.compile(r"\{[^{}]*\}")
+_REFERENCE = re.compile(r"(?<!\\)\$\{(?:(?P<section>[^.:${}]+)[.:])?(?P<option>[^${}]+)\}")
+"""To another option, as Kalico has them (klippy/configfile.py, 2026-07): ${constants.speed}."""
+_MOST_REFERENCES = 10
 _COMMENT = re.compile(r"#.*$|(?:^|\s);.*$")
 
 
@@ -74,8 +77,14 @@ class PrinterConfig:
     included: tuple[Path, ...] = ()
 
     def text(self, section: str, option: str, default: str | None = None) -> str | None:
-        """Return an option as text, or the default."""
-        found = self.sections.get(section, {}).get(option)
+        """Return an option as text, or the default.
+
+        Raises
+        ------
+        ModelError
+            It refers to an option that is not there.
+        """
+        found = self._option(section, option)
         return default if found is None else found.value
 
     def number(self, section: str, option: str, default: float | None = None) -> float:
@@ -86,7 +95,7 @@ class PrinterConfig:
         ModelError
             Naming file, line, section and option: no number, or missing without a default.
         """
-        found = self.sections.get(section, {}).get(option)
+        found = self._option(section, option)
         if found is None:
             if default is None:
                 raise ModelError(
@@ -113,6 +122,25 @@ class PrinterConfig:
                 f"{file or self.name} line {line}: [{section}] {option}: {value:g} must be above 0"
             )
         return value
+
+    def _option(self, section: str, option: str) -> Option | None:
+        """Return an option with what it refers to in place of the references."""
+        found = self.sections.get(section, {}).get(option)
+        for _ in range(_MOST_REFERENCES):
+            if found is None or (reference := _REFERENCE.search(found.value)) is None:
+                break
+            where, name = (reference["section"] or section).lower(), reference["option"].lower()
+            other = self.sections.get(where, {}).get(name)
+            if other is None:
+                remedy = _elsewhere(self.includes) if self.includes else ": put it there"
+                raise ModelError(
+                    f"{found.file or self.name} line {found.line}: [{section}] {option}: "
+                    f"{reference[0]} refers to {name} of [{where}], which is not there{remedy}"
+                )
+            begin, end = reference.span()
+            value = f"{found.value[:begin]}{other.value}{found.value[end:]}"
+            found = found._replace(value=value)
+        return found
 
 
 class Fact(NamedTuple):

@@ -413,6 +413,21 @@ def test_limits_by_axis_of_a_fork_are_told_apart(store: MachineStore, config: Pa
     assert "heavy" not in store.names()
 
 
+def test_constants_of_a_fork(store: MachineStore, config: Path):
+    """Kalico's: an option may refer to one of another section, or of its own."""
+    constants = "[constants]\nTop_Speed: 300\nkind: core${constants.plane}\nplane: xy\n"
+    text = CONFIG.replace("max_velocity: 300", "max_velocity: ${constants.Top_Speed}")
+    text = text.replace("kinematics: corexy", "kinematics: ${constants.kind}")
+    text = text.replace("position_min: -2", "position_min: -${inset}\ninset: 2")
+    assert text.count("${") == 3
+    config.write_text(constants + text)
+    assert machines("from-config", config, "--name", "mine") == 0
+    machine = store.current("mine").machine
+    assert machine.firmware.fastest_mm_s == 300.0
+    assert (machine.kinematics, machine.travel["x"].min_mm) == ("corexy", -2.0)
+    assert differences(machine, read_printer_config(config)) == []
+
+
 def test_typed_in_resonances(store: MachineStore, config: Path):
     arguments = ["--name", "mine", "--fx", 70, "--fy", 55, "--zeta", 0.1]
     assert machines("from-config", config, *arguments) == 0
@@ -499,6 +514,12 @@ def test_resonances_that_are_none(store: MachineStore, config: Path, capsys, her
         ("kinematics: corexy", "kinematics: delta", ["kinematics delta: only", "as sliced"]),
         ("[stepper_z]", "[stepper_q]", ["travel", "z"]),
         ("position_max: 250", "position_max: -9", ["travel", "-2.0", "-9.0"]),
+        (
+            "max_velocity: 300",
+            "max_velocity: ${constants.speed}",
+            ["line 6: [printer] max_velocity: ${constants.speed} refers to speed of [constants]"],
+        ),
+        ("max_velocity: 300", "max_velocity: ${max_velocity}", ["'${max_velocity}' is no number"]),
         ("type_x: ei", "type_x: foo", ["[input_shaper] shaper_type_x", "'foo'", "give zv, mzv"]),
     ],
 )
