@@ -46,6 +46,7 @@ _ADDED: dict[tuple[str, ...], dict[str, Any]] = {
         "ft_motion_version": 2,
         "macros": [],
         "macros_known": False,
+        "no_input_shaper": False,
         "limit_macros": [],
         "arc_circles": False,
         "limits_capped": False,

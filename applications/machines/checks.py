@@ -200,8 +200,10 @@ def machine_from_config(config: PrinterConfig, stated: StatedMachine) -> Machine
     }
     for fact in found:
         _put(document, fact)
-    # No fact, so that machines from before this was noted do not differ from their printers.
-    document.setdefault("firmware", {})["macros_known"] = not config.includes
+    # No facts, so that machines from before these were noted do not differ from their printers.
+    whole = not config.includes
+    document.setdefault("firmware", {})["macros_known"] = whole
+    document["firmware"]["no_input_shaper"] = whole and "input_shaper" not in config.sections
     try:
         machine = Machine.model_validate(document)
     except ValidationError as error:

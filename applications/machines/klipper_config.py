@@ -463,7 +463,7 @@ def _only_limits(name: str, options: dict[str, Option]) -> bool:
         return False
     line = re.compile(rf"SET_VELOCITY_LIMIT(\s+{_LIMIT_MACROS[name]}=(\{{}}|\"\{{}}\"))?\s*")
     plain = _EXPRESSION.sub("{}", _STATEMENT.sub("", body))
-    return all(line.fullmatch(row) for row in plain.split("\n") if row.strip())
+    return all(line.fullmatch(row.strip()) for row in plain.split("\n") if row.strip())
 
 
 def _elsewhere(includes: tuple[str, ...]) -> str:

@@ -481,7 +481,7 @@ class StreamWriter:
             return b""
         self._shaper_off = self._advances = False
         stated, said = self._stream_commands.shaper_on, self._file_shapers.lines.values()
-        if stated is None:
+        if stated is None and not self._stream_commands.shaper_absent:
             set_again = [self._stream_commands.shaped_axes(line) for line in said]
             self._left_off |= {"X", "Y"}.difference(*set_again)
         lines = (stated or b"") + b"".join(said)

@@ -98,6 +98,10 @@ class Klipper(FirmwareFacts):
     extruder: Extruder = Extruder()
     shaper: FirmwareShaper | None = None
     """None: unknown. It is switched off for our moves and stays off, and the report says so."""
+    no_input_shaper: bool = False
+    """printer.cfg was read whole and has no [input_shaper], so that the printer does not know
+    SET_INPUT_SHAPER, and no shaper is advised. Our moves switch it off all the same: it may have
+    been added since."""
     macros: tuple[str, ...] = ()
     """Configured macros with the name of another firmware's word, such as M205 or M900: they may do
     anything. M203 and M205 also set what `limit_macros` says; M204 is named where it sets
@@ -110,6 +114,15 @@ class Klipper(FirmwareFacts):
     limits_capped: bool = False
     """SET_VELOCITY_LIMIT and M204 set no speed and no acceleration above those of `planner`, as on
     Elegoo's Centauri Carbon."""
+
+    @model_validator(mode="after")
+    def _one_shaper(self) -> Klipper:
+        if self.no_input_shaper and self.shaper is not None:
+            raise ValueError(
+                "shaper states a shaper, and no_input_shaper that printer.cfg has none: set "
+                "no_input_shaper to false, or leave shaper out"
+            )
+        return self
 
     @property
     def hotend(self) -> Hotend:

@@ -8,12 +8,14 @@ from datetime import date, timedelta
 from pathlib import Path
 
 import pytest
+from pydantic import ValidationError
 
 from stillpath.applications.machines import transfer
 from stillpath.applications.machines.checks import check_before_job, differences
 from stillpath.applications.machines.klipper_config import read_printer_config
 from stillpath.applications.machines.store import MachineStore
 from stillpath.cli.main import run
+from stillpath.models.firmware import Klipper
 from stillpath.models.machine import CommandLimits, Machine, MotorLimits
 from stillpath.models.store import builtin_machines
 from tests.cli.test_cli import compensate, one_line, pipeline, source
@@ -483,6 +485,31 @@ def test_the_shaper_of_two_carriages_is_unknown(store: MachineStore, config: Pat
     config.write_text(config.read_text() + "[input_shaper]\nshaper_freq_x: 60\n")
     found = differences(machine, read_printer_config(config))
     assert "shaper_freq_x" in [difference.option for difference in found]
+
+
+def test_a_printer_without_a_shaper(store: MachineStore, config: Path):
+    whole = CONFIG.replace("[include mainsail.cfg]", "")
+    plain = whole.partition("[input_shaper]")[0]
+    texts = {"with": whole, "without": plain, "unread": f"[include mainsail.cfg]\n{plain}"}
+    made = {}
+    for name, text in texts.items():
+        config.write_text(text)
+        assert machines("from-config", config, "--name", name) == 0
+        made[name] = store.current(name).machine
+        firmware = made[name].firmware
+        assert firmware.kind == "klipper"
+        assert firmware.no_input_shaper is (name == "without")
+        assert differences(made[name], read_printer_config(config)) == []
+        # A machine from before this was noted does not differ from its printer.
+        before = firmware.model_copy(update={"no_input_shaper": False})
+        machine = made[name].model_copy(update={"firmware": before})
+        assert differences(machine, read_printer_config(config)) == []
+    config.write_text(whole)  # now it has one
+    found = differences(made["without"], read_printer_config(config))
+    assert "shaper_freq_x" in [entry.option for entry in found]
+    section = made["without"].firmware.model_dump(mode="json")
+    with pytest.raises(ValidationError, match="set no_input_shaper to false"):
+        Klipper.model_validate({**section, "shaper": {}})
 
 
 @pytest.mark.parametrize("hertz", ["inf", "nan", "1e101", "501"])

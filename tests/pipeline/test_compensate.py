@@ -469,6 +469,18 @@ def test_a_start_macro_whose_limits_would_be_lost(
     )
 
 
+@pytest.mark.parametrize("absent", [False, True])
+def test_a_printer_without_a_shaper(tmp_path: Path, cache: Path, absent: bool) -> None:
+    """It is switched off all the same, as one may have been added since."""
+    machine = load_machine("ender3")
+    facts = machine.firmware.model_copy(update={"no_input_shaper": absent})
+    machine = machine.model_copy(update={"firmware": facts})
+    result, written = compensated(SMALL, tmp_path, cache, machine, robust="off")
+    assert written.count(b"SET_INPUT_SHAPER SHAPER_FREQ_X=0 SHAPER_FREQ_Y=0") == 1
+    assert any("own input shaper is not known" in line for line in result.warnings) is not absent
+    assert any("had no [input_shaper]" in line for line in result.notes) is absent
+
+
 def test_a_word_that_may_be_a_macro_is_a_note(tmp_path: Path, cache: Path) -> None:
     """Cura writes M205 into every file for Marlin, and most Klippers pass over it."""
     file, machine = SMALL.replace(b"G1 X120", b"M205 X8 Y8\nG1 X120"), load_machine("ender3")

@@ -47,6 +47,7 @@ class KlipperStreamCommands:
 
     def __init__(self, firmware: Klipper) -> None:
         self._shaper = firmware.shaper
+        self.shaper_absent = firmware.no_input_shaper
         self._corner_words = [b"SQUARE_CORNER_VELOCITY"]
         if "M205" in firmware.limit_macros:
             self._corner_words.append(b"M205")
