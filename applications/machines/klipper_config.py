@@ -380,6 +380,11 @@ def _extruder(config: PrinterConfig) -> list[Fact]:
             ("max_extrude_only_distance", f"{place}.max_extrude_only_distance_mm", 50.0),
             ("max_extrude_cross_section", f"{place}.max_extrude_cross_section_mm2", 4 * nozzle**2),
             ("pressure_advance", "pressure_advance_s", 0.0),
+            (
+                "pressure_advance_smooth_time",
+                f"{place}.pressure_advance_smooth_time_s",
+                0.04,
+            ),
         ),
     ]
 

@@ -63,6 +63,7 @@ class Extruder(Hotend):
     max_extrude_only_distance_mm: Positive = 50.0
     max_extrude_cross_section_mm2: Positive | None = None
     """None: Klipper's default, 4 nozzle_diameter^2."""
+    pressure_advance_smooth_time_s: NonNegative = 0.04
 
 
 class FirmwareShaper(Document):

@@ -684,6 +684,7 @@ def test_a_configuration_that_includes_itself(tmp_path: Path, capsys):
     ("old", "new", "line"),
     [
         ("max_accel = 4000", "max_accel = 5000", "[printer] max_accel: the printer has 5000, the"),
+        ("advance = 0.04", "advance_smooth_time = .03", "smooth_time: the printer has 0.03, the m"),
         ("advance = 0.04", "advance = 0.05", "[extruder] pressure_advance: the printer has 0.05"),
         ("freq_x = 61.2", "freq_x = 58", "[input_shaper] shaper_freq_x: the printer has 58, the"),
         ("type_x: ei", "type_x: mzv (n=4, t=1.0)", "shaper_type_x: the printer has mzv(n=4,t=1.0)"),

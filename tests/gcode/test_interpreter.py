@@ -9,7 +9,7 @@ from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.types import EventKind, ProgramBlock
-from stillpath.models.firmware.klipper import PlannerLimits
+from stillpath.models.firmware.klipper import Extruder, PlannerLimits
 from stillpath.models.machine import Machine
 from tests.gcode.cutting import blocks_of
 
@@ -283,6 +283,18 @@ def test_classes(wary_machine: Machine) -> None:
     assert dict(zip(expected, kinds(block), strict=True)) == expected
     # The dwell, and how far pressure advance looks ahead: after none, and twice for the shaper.
     assert block.events.dwell_s.sum() == pytest.approx(0.2 + 0.021 + 0.04)
+
+
+@pytest.mark.parametrize("smooth_s", [0.02, 0.04])
+def test_klipper_stands_for_the_stated_smooth_time(golden_machine: Machine, smooth_s: float):
+    """Creality's have 0.02, and a file that adapts pressure advance stops thousands of times."""
+    extruder = Extruder(pressure_advance_smooth_time_s=smooth_s)
+    facts = {"extruder": extruder, "stopping_macros": ("SET_PRESSURE_ADVANCE",)}
+    firmware = golden_machine.firmware.model_copy(update=facts)
+    machine = golden_machine.model_copy(update={"firmware": firmware, "pressure_advance_s": 0.05})
+    for line, dwell_s in (("ADVANCE=.06", smooth_s), ("SMOOTH_TIME=.1", 0.5 * smooth_s + 0.05)):
+        block = run(f"G1 X5 F600\nSET_PRESSURE_ADVANCE {line}\nG1 X9\n", machine)
+        assert block.events.dwell_s.sum() == pytest.approx(dwell_s)
 
 
 @pytest.mark.parametrize(

@@ -29,8 +29,6 @@ from stillpath.models.shaper_pulses import SHAPERS, shaper_pulses
 __all__ = ["pressure_advance", "shaper"]
 
 _LEAST_S = 1e-3
-_SMOOTH_S = 0.04
-"""Klipper's default of pressure_advance_smooth_time."""
 _MOST_SMOOTH_S = 0.2
 _MOST_REACH_S = 1.0
 _KINDS = tuple(SHAPERS)
@@ -116,8 +114,10 @@ def _ahead_s(state: MachineState) -> float:
 def _extruder_smooth_s(state: MachineState, extruder: int) -> float:
     """Return the time over which an extruder's speed is averaged; 0: it is not."""
     advance_s = state.factors.get(f"ADVANCE {extruder}", state.machine.pressure_advance_s)
-    smooth_s = state.factors.get(f"SMOOTH_TIME {extruder}", _SMOOTH_S) if advance_s > 0.0 else 0.0
-    return min(smooth_s, _MOST_SMOOTH_S)
+    if not (advance_s > 0.0 and isinstance(state.firmware, Klipper)):
+        return 0.0
+    stated_s = state.firmware.extruder.pressure_advance_smooth_time_s
+    return min(state.factors.get(f"SMOOTH_TIME {extruder}", stated_s), _MOST_SMOOTH_S)
 
 
 def _shaper(state: MachineState, axis: str) -> tuple[str, float, float]:
