@@ -31,6 +31,9 @@ _CAPS = "max_velocity_silent"
 """An option of Elegoo's Centauri Carbon, where SET_VELOCITY_LIMIT and M204 stop at printer.cfg's
 limits, and M900 sets pressure advance (elegooofficial/CentauriCarbon, firmware/core/klippy/
 toolhead.cpp, kinematics/extruder.cpp, 2025-09)."""
+_KALICO = ("danger_options", "constants")
+"""Sections that Kalico alone has, which stops at each SET_PRESSURE_ADVANCE (klippy/kinematics/
+extruder.py, 2026-07)."""
 _LARGEST_BYTES = 4_000_000
 _MOST_FILES = 500
 _LONGEST_MACRO = 4000
@@ -183,7 +186,7 @@ def facts(config: PrinterConfig) -> list[Fact]:
 
     If an included file was not found, sections that are missing altogether yield no facts.
     """
-    known = [_printer, _travel, _extruder, _shaper, _retraction, _arcs, _macros]
+    known = [_printer, _fork, _travel, _extruder, _shaper, _retraction, _arcs, _macros]
     return [fact for find in known for fact in find(config)]
 
 
@@ -312,6 +315,12 @@ def _printer(config: PrinterConfig) -> list[Fact]:
             if _CAPS in options
         ),
     ]
+
+
+def _fork(config: PrinterConfig) -> list[Fact]:
+    stops = ["SET_PRESSURE_ADVANCE"]
+    found = [section for section in _KALICO if section in config.sections]
+    return [Fact(section, "", "firmware.stopping_macros", stops) for section in found[:1]]
 
 
 def _travel(config: PrinterConfig) -> list[Fact]:

@@ -427,7 +427,12 @@ def test_constants_of_a_fork(store: MachineStore, config: Path):
     machine = store.current("mine").machine
     assert machine.firmware.fastest_mm_s == 300.0
     assert (machine.kinematics, machine.travel["x"].min_mm) == ("corexy", -2.0)
+    assert machine.firmware.stopping_macros == ("SET_PRESSURE_ADVANCE",)
     assert differences(machine, read_printer_config(config)) == []
+    config.write_text(f"[danger_options]\nlog_statistics: False\n{CONFIG}")
+    assert machines("from-config", config, "--name", "other") == 0
+    firmware = store.current("other").machine.firmware
+    assert firmware.stopping_macros == ("SET_PRESSURE_ADVANCE",)
 
 
 def test_typed_in_resonances(store: MachineStore, config: Path):
