@@ -215,6 +215,8 @@ def machine_from_config(config: PrinterConfig, stated: StatedMachine) -> Machine
 def _check_kinematics(config: PrinterConfig) -> None:
     """Refuse unknown kinematics, and a fork's with fixed limits by axis (Kalico, 2026)."""
     kinematics = config.text("printer", "kinematics") or ""
+    if not kinematics and config.includes:
+        raise config.lacks("printer", "kinematics")
     plain = kinematics.removeprefix("limited_")
     if plain and plain not in ("cartesian", "corexy"):
         raise ModelError(

@@ -32,8 +32,7 @@ _CAPS = "max_velocity_silent"
 limits, and M900 sets pressure advance (elegooofficial/CentauriCarbon, firmware/core/klippy/
 toolhead.cpp, kinematics/extruder.cpp, 2025-09)."""
 _KALICO = ("danger_options", "constants")
-"""Sections that Kalico alone has, which stops at each SET_PRESSURE_ADVANCE (klippy/kinematics/
-extruder.py, 2026-07)."""
+"""Sections of Kalico alone, which stops at each SET_PRESSURE_ADVANCE (extruder.py, 2026-07)."""
 _LARGEST_BYTES = 4_000_000
 _MOST_FILES = 500
 _LONGEST_MACRO = 4000
@@ -101,9 +100,7 @@ class PrinterConfig:
         found = self._option(section, option)
         if found is None:
             if default is None:
-                raise ModelError(
-                    f"{self.name}: [{section}] lacks {option}{_elsewhere(self.includes)}"
-                )
+                raise self.lacks(section, option)
             return default
         try:
             value = float(found.value)
@@ -115,6 +112,10 @@ class PrinterConfig:
                 f"{found.value!r:.60} is no number"
             )
         return value
+
+    def lacks(self, section: str, option: str) -> ModelError:
+        """Return the error that an option is missing, with where it may stand."""
+        return ModelError(f"{self.name}: [{section}] lacks {option}{_elsewhere(self.includes)}")
 
     def positive(self, section: str, option: str) -> float:
         """Return a number that must be there and above 0."""
@@ -389,11 +390,7 @@ def _extruder(config: PrinterConfig) -> list[Fact]:
             ("max_extrude_only_distance", f"{place}.max_extrude_only_distance_mm", 50.0),
             ("max_extrude_cross_section", f"{place}.max_extrude_cross_section_mm2", 4 * nozzle**2),
             ("pressure_advance", "pressure_advance_s", 0.0),
-            (
-                "pressure_advance_smooth_time",
-                f"{place}.pressure_advance_smooth_time_s",
-                0.04,
-            ),
+            ("pressure_advance_smooth_time", f"{place}.pressure_advance_smooth_time_s", 0.04),
         ),
     ]
 

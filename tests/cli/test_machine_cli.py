@@ -542,6 +542,7 @@ def test_resonances_that_are_none(store: MachineStore, config: Path, capsys, her
             "filament_diameter: 0",
             ["[extruder] filament_diameter: 0 must be above 0"],
         ),
+        ("kinematics: corexy", "", ["[printer] lacks kinematics", "mainsail.cfg", "cat them"]),
         ("max_accel = 4000", "", ["[printer] lacks max_accel", "mainsail.cfg", "was not read"]),
         ("kinematics: corexy", "kinematics: delta", ["kinematics delta: only", "as sliced"]),
         ("[stepper_z]", "[stepper_q]", ["travel", "z"]),
