@@ -13,7 +13,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
-from stillpath.gcode.firmware.klipper.dialect import FOREIGN
+from stillpath.applications.machines.klipper_macros import (
+    LONGEST_MACRO,
+    limit_macros,
+    other_macros,
+    sets_shaper,
+)
 from stillpath.models.errors import ModelError
 from stillpath.models.firmware.klipper import shaper_type
 from stillpath.models.user_files import as_utf8, read_bytes
@@ -35,15 +40,9 @@ _KALICO = ("danger_options", "constants")
 """Sections of Kalico alone, which stops at each SET_PRESSURE_ADVANCE (extruder.py, 2026-07)."""
 _LARGEST_BYTES = 4_000_000
 _MOST_FILES = 500
-_LONGEST_MACRO = 4000
 _SAVED_PREFIX = "#*# "
 _SECTION = re.compile(r"\[(?P<name>[^]]+)\]\s*$")
 _OPTION = re.compile(r"(?P<name>[^\s:=][^:=]*)[:=]\s*(?P<value>.*)$")
-_HALVES = re.compile(r"ACCEL_TO_DECEL=\{[^{}\n]*/\s*2(\.0*)?\s*\}")
-"""In M204 of QIDI's printers (QIDITECH, gcode_macro.cfg, 2023 to 2025)."""
-_LIMIT_MACROS = {"M203": "VELOCITY", "M205": "SQUARE_CORNER_VELOCITY"}
-"""Macros that makers have for Cura's files, and what they set."""
-_STATEMENT, _EXPRESSION = re.compile(r"\{%.*?%\}", re.DOTALL), re.compile(r"\{[^{}]*\}")
 _REFERENCE = re.compile(r"(?<!\\)\$\{(?:(?P<section>[^.:${}]+)[.:])?(?P<option>[^${}]+)\}")
 """To another option, as Kalico has them (klippy/configfile.py, 2026-07): ${constants.speed}."""
 _MOST_REFERENCES = 10
@@ -77,6 +76,14 @@ class PrinterConfig:
     sections: _Sections = field(default_factory=dict)
     includes: tuple[str, ...] = ()
     included: tuple[Path, ...] = ()
+
+    @property
+    def texts(self) -> dict[str, dict[str, str]]:
+        """The options' texts by section, as they are written."""
+        return {
+            section: {name: option.value for name, option in options.items()}
+            for section, options in self.sections.items()
+        }
 
     def text(self, section: str, option: str, default: str | None = None) -> str | None:
         """Return an option as text, or the default.
@@ -243,7 +250,7 @@ class _Reader:
                 kept = current[begun].value
                 if not kept:
                     current[begun] = Option(line, number, file)
-                elif begun == "gcode" and len(kept) < _LONGEST_MACRO:
+                elif begun.endswith("gcode") and len(kept) < LONGEST_MACRO:
                     current[begun] = current[begun]._replace(value=f"{kept}\n{line}")
                 continue
             begun_at = None
@@ -400,10 +407,8 @@ def _shaper(config: PrinterConfig) -> list[Fact]:
     if section not in config.sections:
         return [] if config.includes else [Fact(section, "", place, None)]
     rates = [option for option in config.sections[section] if option[:-1].endswith("_freq_")]
-    if "dual_carriage" in config.sections and not any(config.number(section, o) for o in rates):
-        # Newer Klippers take each carriage's shaper from SET_INPUT_SHAPER alone, in [delayed_gcode]
-        # (klippy/extras/input_shaper.py, 2026-08): what is in force is unknown, not off.
-        return []
+    if sets_shaper(config.texts) and not any(config.number(section, option) for option in rates):
+        return []  # what is in force is unknown, not off
     common = config.text(section, "shaper_type", "mzv")
     found = []
     for axis in "xy":
@@ -449,32 +454,17 @@ def _arcs(config: PrinterConfig) -> list[Fact]:
 
 
 def _macros(config: PrinterConfig) -> list[Fact]:
-    """Macros that would otherwise be taken for words of another firmware, or for Klipper's M204."""
-    named = {
-        section.partition("gcode_macro ")[2].strip().upper(): options
-        for section, options in config.sections.items()
-    }
-    limits = [name for name in _LIMIT_MACROS if name in named and _only_limits(name, named[name])]
-    macros = sorted(named.keys() & FOREIGN.keys() - set(limits))
-    body = named.get("M204", {}).get("gcode")
-    if body is not None and _HALVES.search(body.value):
-        macros = sorted([*macros, "M204"])
-    found = (("firmware.macros", macros), ("firmware.limit_macros", limits))
+    """Return macros that change how words of other firmwares are read, or M204."""
+    texts = config.texts
+    found = (
+        ("firmware.macros", other_macros(texts)),
+        ("firmware.limit_macros", limit_macros(texts)),
+    )
     return [
         Fact("gcode_macro", "", place, names)
         for place, names in found
         if names or not config.includes
     ]
-
-
-def _only_limits(name: str, options: dict[str, Option]) -> bool:
-    """Return whether a macro sets its limit from X and Y as they are, and does nothing else."""
-    body = options["gcode"].value if "gcode" in options else ""
-    if not body or len(body) >= _LONGEST_MACRO or re.search(r"[*/+]", body):
-        return False
-    line = re.compile(rf"SET_VELOCITY_LIMIT(\s+{_LIMIT_MACROS[name]}=(\{{}}|\"\{{}}\"))?\s*")
-    plain = _EXPRESSION.sub("{}", _STATEMENT.sub("", body))
-    return all(line.fullmatch(row.strip()) for row in plain.split("\n") if row.strip())
 
 
 def _elsewhere(includes: tuple[str, ...]) -> str:

@@ -492,6 +492,33 @@ def test_the_shaper_of_two_carriages_is_unknown(store: MachineStore, config: Pat
     assert "shaper_freq_x" in [difference.option for difference in found]
 
 
+@pytest.mark.parametrize(
+    ("more", "known"),
+    [
+        ("[tool T0]\nafter_change_gcode:\n  M117\n  set_input_shaper SHAPER_FREQ_X=50\n", False),
+        ("[tool T0]\nparams_input_shaper_freq_x: 50\n", False),
+        ("[delayed_gcode a]\ngcode:\n  {% if 1 %}\n  SET_INPUT_SHAPER SHAPER_FREQ_X=50\n", False),
+        ("[gcode_macro STILLPATH_SHAPER_ON]\ngcode:\n  SET_INPUT_SHAPER SHAPER_FREQ_X=0\n", True),
+    ],
+)
+def test_the_shaper_of_a_tool_changer_is_unknown(
+    store: MachineStore, config: Path, more: str, known: bool
+):
+    """Its macros set each tool's: off behind a stretch is not what was in force."""
+    plain = CONFIG.partition("[input_shaper]")[0]
+    config.write_text(f"{plain}[input_shaper]\n{more}")
+    assert machines("from-config", config, "--name", "mine") == 0
+    machine = store.current("mine").machine
+    assert machine.firmware.kind == "klipper"
+    assert (machine.firmware.shaper is not None) is known
+    assert differences(machine, read_printer_config(config)) == []
+    config.write_text(f"{plain}[input_shaper]\nshaper_freq_y: 40\n{more}")
+    assert machines("from-config", config, "--name", "stated") == 0
+    firmware = store.current("stated").machine.firmware
+    assert firmware.kind == "klipper"
+    assert firmware.shaper is not None
+
+
 def test_a_printer_without_a_shaper(store: MachineStore, config: Path):
     whole = CONFIG.replace("[include mainsail.cfg]", "")
     plain = whole.partition("[input_shaper]")[0]
