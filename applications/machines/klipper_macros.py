@@ -15,8 +15,9 @@ __all__ = ["LONGEST_MACRO", "limit_macros", "other_macros", "sets_shaper"]
 
 LONGEST_MACRO = 4000
 """Characters of a macro beyond which no more of it is kept."""
-_HALVES = re.compile(r"ACCEL_TO_DECEL=\{[^{}\n]*/\s*2(\.0*)?\s*\}")
-"""In M204 of QIDI's printers (QIDITECH, gcode_macro.cfg, 2023 to 2025)."""
+_HALVES = re.compile(r"ACCEL_TO_DECEL=\{[^{}\n]*(/\s*2(\.0*)?|\*\s*0?\.50*)\s*\}")
+"""In M204 of QIDI's printers (QIDITECH, gcode_macro.cfg, 2023 to 2025), and of a tool changer with
+KTCC (AkeemA/DakshV2-350-5Tools-Backup, 2025-08)."""
 _LIMITS = {"M203": "VELOCITY", "M205": "SQUARE_CORNER_VELOCITY"}
 """Macros that makers have for Cura's files, and what they set."""
 _STATEMENT, _EXPRESSION = re.compile(r"\{%.*?%\}", re.DOTALL), re.compile(r"\{[^{}]*\}")

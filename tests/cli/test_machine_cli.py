@@ -645,7 +645,12 @@ def test_included_files_are_read_as_klipper_reads_them(store: MachineStore, tmp_
 
 @pytest.mark.parametrize(
     ("line", "macros"),
-    [("ACCEL_TO_DECEL={s/2}", ("M204", "M900")), ("ACCEL_TO_DECEL={s}", ("M900",))],
+    [
+        ("ACCEL_TO_DECEL={s/2}", ("M204", "M900")),
+        ("ACCEL_TO_DECEL={s*0.5}", ("M204", "M900")),
+        ("ACCEL_TO_DECEL={s*0.55}", ("M900",)),
+        ("ACCEL_TO_DECEL={s}", ("M900",)),
+    ],
 )
 def test_a_macro_m204_that_halves(store: MachineStore, config: Path, line: str, macros):
     """As in QIDI's gcode_macro.cfg; Creality's passes M204 on."""
