@@ -307,6 +307,25 @@ def test_klipper_flushes_once_at_a_rest(golden_machine: Machine, between: str, d
     assert block.events.dwell_s.sum() == pytest.approx(dwell_s)
 
 
+@pytest.mark.parametrize("to_decel_mm_s2", [None, 1000.0])
+def test_a_newer_klipper_looks_ahead_as_before_the_first(
+    golden_machine: Machine, to_decel_mm_s2: float | None
+):
+    """Its motion queuing knows how far it has to flush from the last move alone."""
+    planner = golden_machine.firmware.planner.model_copy(
+        update={"max_accel_to_decel_mm_s2": to_decel_mm_s2}
+    )
+    firmware = golden_machine.firmware.model_copy(update={"planner": planner})
+    update = {"firmware": firmware, "pressure_advance_s": 0.0}
+    machine = golden_machine.model_copy(update=update)
+    stands = {}
+    for kinds in (("60",), ("20",), ("60", "20")):
+        lines = "".join(f"SET_INPUT_SHAPER SHAPER_TYPE=zv SHAPER_FREQ_X={f}\n" for f in kinds)
+        stands[kinds] = float(run(f"G1 X5 F600\n{lines}G1 X9\n", machine).events.dwell_s.sum())
+    before_s = 1e-3 if to_decel_mm_s2 is None else stands["60",] - 1e-3
+    assert stands["60", "20"] == pytest.approx(before_s + stands["20",] - 1e-3)
+
+
 def test_a_shaper_with_much_damping_makes_klipper_stand_longer(golden_machine: Machine) -> None:
     """ZV: the second pulse comes half a damped period later, and the middle lies nearer to it."""
     machine = golden_machine.model_copy(update={"pressure_advance_s": 0.0})

@@ -492,4 +492,7 @@ def test_a_word_that_may_be_a_macro_is_a_note(tmp_path: Path, cache: Path) -> No
         assert told == (made is machine)
         seen = simulate_file(tmp_path / "in.gcode", made, cache_dir=cache)
         assert sum("M205 in the middle" in line for line in seen.notes) == told
+        planned = plan_file(tmp_path / "in.gcode", tmp_path / "plan.npz", made)
+        assert sum("M205 in the middle" in line for line in planned.warnings) == told
+        (tmp_path / "plan.npz").unlink()
         (tmp_path / "out.gcode").unlink()

@@ -2,11 +2,12 @@
 
 Steps are generated ahead of their motion, by the look-ahead of input shaper and pressure advance.
 SET_INPUT_SHAPER flushes them all: the next move starts later by the look-ahead before the command
-plus that after it; behind several commands at one rest, by the longest before any of them plus that
-after the last. So does a SET_PRESSURE_ADVANCE that changes the time over which the extruder's
-speed is averaged, which is 0 without pressure advance. Klipper before 2025-09-03, and Kalico, flush
-for every SET_PRESSURE_ADVANCE: their machines name it among their ``stopping_macros``, or have a
-``max_accel_to_decel_mm_s2``, which only a Klipper before 2024-03 has.
+plus that after it; behind several commands at one rest, by that before the first plus that after
+the last (Klipper before 2024: the longest before any of them). So does a SET_PRESSURE_ADVANCE that
+changes the time over which the extruder's speed is averaged, which is 0 without pressure advance.
+Klipper before 2025-09-03, and Kalico, flush for every SET_PRESSURE_ADVANCE: their machines name it
+among their ``stopping_macros``, or have a ``max_accel_to_decel_mm_s2``, which only a Klipper before
+2024-03 has.
 
 Sources: klippy/toolhead.py (flush_step_generation, _calc_print_time), klippy/extras/
 motion_queuing.py, klippy/extras/input_shaper.py, klippy/kinematics/extruder.py
@@ -87,8 +88,8 @@ def _flush(state: MachineState, kind: EventKind, before_s: float) -> int:
     # A macro may have moved.
     place, counted_s = state.moves + int(state.i[at.I_MACROS]), 0.0
     if known.get("flushed at") == place:
-        before_s = max(before_s, known["flushed before"])
-        counted_s = known["flushed for"]
+        first_s, counted_s = known["flushed before"], known["flushed for"]
+        before_s = max(before_s, first_s) if _is_older(state) else first_s
     stands_s = max(before_s + _ahead_s(state), counted_s)
     known |= {"flushed at": place, "flushed before": before_s, "flushed for": stands_s}
     return state.event(kind, stands_s - counted_s)
@@ -96,10 +97,13 @@ def _flush(state: MachineState, kind: EventKind, before_s: float) -> int:
 
 def _always_stops(state: MachineState, command: Command) -> bool:
     """Return whether the machine's Klipper flushes even if nothing changes."""
+    return _is_older(state) or command.name in map(str.upper, state.firmware.stopping_macros)
+
+
+def _is_older(state: MachineState) -> bool:
+    """Return whether the machine's Klipper is from before 2024-03."""
     firmware = state.firmware
-    if isinstance(firmware, Klipper) and firmware.planner.max_accel_to_decel_mm_s2 is not None:
-        return True
-    return command.name in map(str.upper, firmware.stopping_macros)
+    return isinstance(firmware, Klipper) and firmware.planner.max_accel_to_decel_mm_s2 is not None
 
 
 def _ahead_s(state: MachineState) -> float:
