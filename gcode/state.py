@@ -98,7 +98,11 @@ class MachineState:
         The first one of an unknown name, and its line.
     warnings : dict of str to int
         What the firmware skips or what is unknown, with the line of first occurrence.
+    notes : dict of str to int
+        The same of what only some printers of this kind do not skip.
     """
+
+    _passed_on = 0
 
     def __init__(self, machine: Machine, dialect: Dialect, limits: Limits, *, strict: bool) -> None:
         self.machine = machine
@@ -125,14 +129,14 @@ class MachineState:
         self.tool_known = dialect.tool_at_start
         self.conditional_indent = -1
         self.warnings: dict[str, int] = {}
+        self.notes: dict[str, int] = {}
         self.layer_style: str | None = None
         self.carry_out: Callable[[Command], int] = nobody
         self.buffer = np.zeros(0, np.uint8)
         self.span = (0, 0)
         self.remembers = True
         """The line in hand is one command (`remember`)."""
-        self.memos = 0
-        self.memo_limits = 0
+        self.memos = self.memo_limits = 0
 
         self.f = f = np.zeros(at.F_SIZE)
         self.i = i = np.zeros(at.I_SIZE, np.int64)
@@ -171,6 +175,11 @@ class MachineState:
         copies = {name: table.copy() for name, table in self.tables._asdict().items()}
         other.tables = Tables(**copies)
         return other
+
+    @property
+    def moves(self) -> int:
+        """Number of moves so far."""
+        return self._passed_on + int(self.i[at.I_MOVES])
 
     # What a line does
 
@@ -356,8 +365,15 @@ class MachineState:
 
     def warn(self, message: str) -> None:
         """Record a warning with the first line at which it occurs."""
-        if len(self.warnings) < 100:
-            self.warnings.setdefault(message, int(self.i[at.I_LINE]))
+        self._record(self.warnings, message)
+
+    def note(self, message: str) -> None:
+        """Record a note with the first line at which it occurs."""
+        self._record(self.notes, message)
+
+    def _record(self, found: dict[str, int], message: str) -> None:
+        if len(found) < 100:
+            found.setdefault(message, int(self.i[at.I_LINE]))
 
     def change_retraction(self, **changes: float) -> None:
         """Change what G10 and G11 do."""
@@ -368,6 +384,7 @@ class MachineState:
 
     def allocate(self, count: int) -> None:
         """Allocate new rows; the previous ones have been passed on."""
+        self._passed_on = self.moves
         self.rows = Rows.empty(count)
         i = self.i
         i[at.I_MOVES] = i[at.I_EVENTS] = i[at.I_FILLED_MOVES] = i[at.I_FILLED_EVENTS] = 0

@@ -45,9 +45,13 @@ _ADDED: dict[tuple[str, ...], dict[str, Any]] = {
         "ft_motion": False,
         "ft_motion_version": 2,
         "macros": [],
+        "macros_known": False,
+        "no_input_shaper": False,
+        "limit_macros": [],
         "arc_circles": False,
         "limits_capped": False,
     },
+    ("firmware", "extruder"): {"pressure_advance_smooth_time_s": 0.04},
     ("firmware", "planner"): {"max_accel_to_decel_mm_s2": None},
 }
 """Fields that older documents lack, by place, with the value that says nothing new: where they have

@@ -26,7 +26,7 @@ from stillpath.pipeline.endless import LengthGuard
 from stillpath.pipeline.measuring.points import MotionSamples
 from stillpath.pipeline.options import DialectName
 from stillpath.pipeline.progress import ProgressCallback, ProgressReports, progress_to
-from stillpath.pipeline.reading import dialect_for, doubts, passed_over
+from stillpath.pipeline.reading import dialect_for, doubts, passed_over, perhaps_passed_over
 
 __all__ = ["STANDING_S", "FileMotion", "MotionPart", "TextMotion"]
 
@@ -130,6 +130,11 @@ class TextMotion:
     def warnings(self) -> list[str]:
         """Return warnings about commands that the firmware skips, or that are not modelled."""
         return [*passed_over(self.reader), *sorted(self._unmodelled)]
+
+    @property
+    def notes(self) -> list[str]:
+        """Return notes on commands that the firmware skips unless the printer has them."""
+        return perhaps_passed_over(self.reader)
 
     def __iter__(self) -> Iterator[MotionPart]:
         file = self._file
@@ -278,6 +283,7 @@ class FileMotion:
         self.feature_names: list[str] = []
         self.facts = SlicerFacts()
         self.warnings: list[str] = []
+        self.notes: list[str] = []
         self.shapers: list[str] = []
 
     def __iter__(self) -> Iterator[MotionPart]:
@@ -298,6 +304,7 @@ class FileMotion:
             yield from motion
         self.time_s, self.shapers = motion.time_s, motion.shapers
         self.warnings = [*doubtful, *motion.warnings]
+        self.notes = motion.notes
 
 
 def _all(sampler: Sampler, phases: Phases, *, final: bool) -> Iterator[Samples]:

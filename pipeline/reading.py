@@ -16,7 +16,13 @@ from stillpath.models.firmware import Marlin, RepRapFirmware
 from stillpath.models.machine import Machine
 from stillpath.pipeline.options import DialectName
 
-__all__ = ["dialect_for", "doubts", "extruder_mode_awaited", "passed_over"]
+__all__ = [
+    "dialect_for",
+    "doubts",
+    "extruder_mode_awaited",
+    "passed_over",
+    "perhaps_passed_over",
+]
 
 _SHOWN = 5
 _END_BYTES = 1 << 18
@@ -145,6 +151,14 @@ def doubts(file: BinaryIO, machine: Machine, name: DialectName | None = None) ->
 
 def passed_over(reader: Interpreter) -> list[str]:
     """Return a few warnings about commands that the firmware skips or that are unknown."""
-    found = reader.warnings
+    return _few(reader.warnings)
+
+
+def perhaps_passed_over(reader: Interpreter) -> list[str]:
+    """Return a few notes on commands that the firmware skips unless the printer has them."""
+    return _few([f"line {line}: {text}" for text, line in reader.state.notes.items()])
+
+
+def _few(found: list[str]) -> list[str]:
     more = [f"... and {len(found) - _SHOWN} more lines like these"] if len(found) > _SHOWN else []
     return [*found[:_SHOWN], *more]

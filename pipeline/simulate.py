@@ -100,7 +100,8 @@ def plan_file(
             samples = part.samples
             rows = (samples.t_s, *samples.xyz_mm, samples.e_mm)
             table.write(dict(zip(_COLUMNS, rows, strict=True)))
-    return PlannedTime(motion.time_s, motion.facts.slicer, motion.facts.estimate_s, motion.warnings)
+    told = [*motion.warnings, *motion.notes]
+    return PlannedTime(motion.time_s, motion.facts.slicer, motion.facts.estimate_s, told)
 
 
 def simulate_file(
@@ -161,7 +162,7 @@ def simulate_motion(
         check_unchanged(motion.source, began)
         if writer is not None:
             writer.finish(motion.feature_names)
-    notes = operation.notes()
+    notes = [*operation.notes(), *motion.notes]
     if any(label != OFF.label for label in motion.shapers):
         notes.append(f"The file sets the firmware's shaper: {', '.join(motion.shapers)}.")
     return Result(

@@ -20,7 +20,7 @@ from stillpath.pipeline.operating_point import Operation
 from stillpath.pipeline.options import COARSE_UM, Options
 from stillpath.pipeline.pacing.budget import SpeedBudget
 from stillpath.pipeline.pacing.budget_measure import BudgetMeasurement
-from stillpath.pipeline.reading import passed_over
+from stillpath.pipeline.reading import passed_over, perhaps_passed_over
 from stillpath.pipeline.result import Channel, Result
 from stillpath.pipeline.selection import Selection
 from stillpath.pipeline.totals import Totals
@@ -135,8 +135,10 @@ class Summary:
         if self.choice is not None and any(self.choice.shares):
             yield prediction_note(self.machine, self.choice)
         yield from self.operation.notes()
+        yield from perhaps_passed_over(self.reader)
         if self.writer is not None:
             yield from self._macro_with_limits()
+            yield from self._no_shaper()
             yield from self.totals.left_out_notes(self.options.where)
             if self.options.max_mb is not None:
                 yield (
@@ -156,6 +158,16 @@ class Summary:
                 f"{firmware.largest_accel_mm_s2:g} mm/s2, which compensated stretches put in force "
                 f"behind them. If {name} (line {line}) or another macro sets another, its setting "
                 "is not seen, and lost: let the slicer write it (SET_VELOCITY_LIMIT ACCEL=...)"
+            )
+
+    def _no_shaper(self) -> Iterator[str]:
+        """Yield a note where the printer has no shaper as far as is known."""
+        firmware = self.machine.firmware
+        if firmware.kind == "klipper" and firmware.no_input_shaper and self.totals.segments:
+            yield (
+                "printer.cfg had no [input_shaper] when the machine was made (no_input_shaper in "
+                "its firmware section). If it has one now, make the machine again, or else that "
+                "shaper is off after the print until Klipper restarts"
             )
 
     def _other_heads(self, facts: SlicerFacts) -> Iterator[str]:

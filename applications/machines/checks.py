@@ -200,6 +200,10 @@ def machine_from_config(config: PrinterConfig, stated: StatedMachine) -> Machine
     }
     for fact in found:
         _put(document, fact)
+    # No facts, so that machines from before these were noted do not differ from their printers.
+    whole = not config.includes
+    document.setdefault("firmware", {})["macros_known"] = whole
+    document["firmware"]["no_input_shaper"] = whole and "input_shaper" not in config.sections
     try:
         machine = Machine.model_validate(document)
     except ValidationError as error:
@@ -211,6 +215,8 @@ def machine_from_config(config: PrinterConfig, stated: StatedMachine) -> Machine
 def _check_kinematics(config: PrinterConfig) -> None:
     """Refuse unknown kinematics, and a fork's with fixed limits by axis (Kalico, 2026)."""
     kinematics = config.text("printer", "kinematics") or ""
+    if not kinematics and config.includes:
+        raise config.lacks("printer", "kinematics")
     plain = kinematics.removeprefix("limited_")
     if plain and plain not in ("cartesian", "corexy"):
         raise ModelError(
@@ -431,6 +437,8 @@ def _word(value: Any) -> str:
             return "on" if value else "off"
         case float():
             return f"{value:g}"
+        case list() | tuple():
+            return ", ".join(map(str, value)) or "none"
         case dict():
             return ", ".join(f"{key} {_word(entry)}" for key, entry in value.items())
         case _:

@@ -13,7 +13,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
-from stillpath.gcode.firmware.klipper.dialect import FOREIGN
+from stillpath.applications.machines.klipper_macros import (
+    LONGEST_MACRO,
+    limit_macros,
+    other_macros,
+    sets_shaper,
+)
 from stillpath.models.errors import ModelError
 from stillpath.models.firmware.klipper import shaper_type
 from stillpath.models.user_files import as_utf8, read_bytes
@@ -31,14 +36,16 @@ _CAPS = "max_velocity_silent"
 """An option of Elegoo's Centauri Carbon, where SET_VELOCITY_LIMIT and M204 stop at printer.cfg's
 limits, and M900 sets pressure advance (elegooofficial/CentauriCarbon, firmware/core/klippy/
 toolhead.cpp, kinematics/extruder.cpp, 2025-09)."""
+_KALICO = ("danger_options", "constants")
+"""Sections of Kalico alone, which stops at each SET_PRESSURE_ADVANCE (extruder.py, 2026-07)."""
 _LARGEST_BYTES = 4_000_000
 _MOST_FILES = 500
-_LONGEST_MACRO = 4000
 _SAVED_PREFIX = "#*# "
 _SECTION = re.compile(r"\[(?P<name>[^]]+)\]\s*$")
 _OPTION = re.compile(r"(?P<name>[^\s:=][^:=]*)[:=]\s*(?P<value>.*)$")
-_HALVES = re.compile(r"ACCEL_TO_DECEL=\{[^{}\n]*/\s*2(\.0*)?\s*\}")
-"""In M204 of QIDI's printers (QIDITECH, gcode_macro.cfg, 2023 to 2025)."""
+_REFERENCE = re.compile(r"(?<!\\)\$\{(?:(?P<section>[^.:${}]+)[.:])?(?P<option>[^${}]+)\}")
+"""To another option, as Kalico has them (klippy/configfile.py, 2026-07): ${constants.speed}."""
+_MOST_REFERENCES = 10
 _COMMENT = re.compile(r"#.*$|(?:^|\s);.*$")
 
 
@@ -70,9 +77,23 @@ class PrinterConfig:
     includes: tuple[str, ...] = ()
     included: tuple[Path, ...] = ()
 
+    @property
+    def texts(self) -> dict[str, dict[str, str]]:
+        """The options' texts by section, as they are written."""
+        return {
+            section: {name: option.value for name, option in options.items()}
+            for section, options in self.sections.items()
+        }
+
     def text(self, section: str, option: str, default: str | None = None) -> str | None:
-        """Return an option as text, or the default."""
-        found = self.sections.get(section, {}).get(option)
+        """Return an option as text, or the default.
+
+        Raises
+        ------
+        ModelError
+            It refers to an option that is not there.
+        """
+        found = self._option(section, option)
         return default if found is None else found.value
 
     def number(self, section: str, option: str, default: float | None = None) -> float:
@@ -83,12 +104,10 @@ class PrinterConfig:
         ModelError
             Naming file, line, section and option: no number, or missing without a default.
         """
-        found = self.sections.get(section, {}).get(option)
+        found = self._option(section, option)
         if found is None:
             if default is None:
-                raise ModelError(
-                    f"{self.name}: [{section}] lacks {option}{_elsewhere(self.includes)}"
-                )
+                raise self.lacks(section, option)
             return default
         try:
             value = float(found.value)
@@ -101,6 +120,10 @@ class PrinterConfig:
             )
         return value
 
+    def lacks(self, section: str, option: str) -> ModelError:
+        """Return the error that an option is missing, with where it may stand."""
+        return ModelError(f"{self.name}: [{section}] lacks {option}{_elsewhere(self.includes)}")
+
     def positive(self, section: str, option: str) -> float:
         """Return a number that must be there and above 0."""
         value = self.number(section, option)
@@ -110,6 +133,25 @@ class PrinterConfig:
                 f"{file or self.name} line {line}: [{section}] {option}: {value:g} must be above 0"
             )
         return value
+
+    def _option(self, section: str, option: str) -> Option | None:
+        """Return an option with what it refers to in place of the references."""
+        found = self.sections.get(section, {}).get(option)
+        for _ in range(_MOST_REFERENCES):
+            if found is None or (reference := _REFERENCE.search(found.value)) is None:
+                break
+            where, name = (reference["section"] or section).lower(), reference["option"].lower()
+            other = self.sections.get(where, {}).get(name)
+            if other is None:
+                remedy = _elsewhere(self.includes) if self.includes else ": put it there"
+                raise ModelError(
+                    f"{found.file or self.name} line {found.line}: [{section}] {option}: "
+                    f"{reference[0]} refers to {name} of [{where}], which is not there{remedy}"
+                )
+            begin, end = reference.span()
+            value = f"{found.value[:begin]}{other.value}{found.value[end:]}"
+            found = found._replace(value=value)
+        return found
 
 
 class Fact(NamedTuple):
@@ -152,7 +194,7 @@ def facts(config: PrinterConfig) -> list[Fact]:
 
     If an included file was not found, sections that are missing altogether yield no facts.
     """
-    known = [_printer, _travel, _extruder, _shaper, _retraction, _arcs, _macros]
+    known = [_printer, _fork, _travel, _extruder, _shaper, _retraction, _arcs, _macros]
     return [fact for find in known for fact in find(config)]
 
 
@@ -208,7 +250,7 @@ class _Reader:
                 kept = current[begun].value
                 if not kept:
                     current[begun] = Option(line, number, file)
-                elif begun == "gcode" and len(kept) < _LONGEST_MACRO:
+                elif begun.endswith("gcode") and len(kept) < LONGEST_MACRO:
                     current[begun] = current[begun]._replace(value=f"{kept}\n{line}")
                 continue
             begun_at = None
@@ -257,8 +299,6 @@ def _printer(config: PrinterConfig) -> list[Fact]:
     else:
         ratio = config.number(section, option, ratio)
     planner, options = "firmware.planner", config.sections[section]
-    # Klippers that take this option are from before 2025-09, when these commands stop the head.
-    stopping = ["SET_PRESSURE_ADVANCE", *(["M900"] if _CAPS in options else [])]
     older = f"{planner}.max_accel_to_decel_mm_s2"
     return [
         Fact(section, "kinematics", "kinematics", config.text(section, "kinematics")),
@@ -266,7 +306,6 @@ def _printer(config: PrinterConfig) -> list[Fact]:
         Fact(section, "max_accel", f"{planner}.max_accel_mm_s2", accel),
         Fact(section, option, f"{planner}.minimum_cruise_ratio", ratio),
         *([Fact(section, option, older, to_decel)] if to_decel else []),
-        *([Fact(section, option, "firmware.stopping_macros", stopping)] if to_decel else []),
         *_numbers(
             config,
             section,
@@ -275,8 +314,21 @@ def _printer(config: PrinterConfig) -> list[Fact]:
             ("max_z_accel", f"{planner}.max_z_accel_mm_s2", accel),
         ),
         # Only a firmware that has this option is known to cap what a file sets.
-        *(Fact(section, name, "firmware.limits_capped", True) for name in {_CAPS} & options.keys()),
+        *(
+            Fact(section, _CAPS, place, value)
+            for place, value in (
+                ("firmware.limits_capped", True),
+                ("firmware.stopping_macros", ["M900"]),
+            )
+            if _CAPS in options
+        ),
     ]
+
+
+def _fork(config: PrinterConfig) -> list[Fact]:
+    stops = ["SET_PRESSURE_ADVANCE"]
+    found = [section for section in _KALICO if section in config.sections]
+    return [Fact(section, "", "firmware.stopping_macros", stops) for section in found[:1]]
 
 
 def _travel(config: PrinterConfig) -> list[Fact]:
@@ -345,6 +397,7 @@ def _extruder(config: PrinterConfig) -> list[Fact]:
             ("max_extrude_only_distance", f"{place}.max_extrude_only_distance_mm", 50.0),
             ("max_extrude_cross_section", f"{place}.max_extrude_cross_section_mm2", 4 * nozzle**2),
             ("pressure_advance", "pressure_advance_s", 0.0),
+            ("pressure_advance_smooth_time", f"{place}.pressure_advance_smooth_time_s", 0.04),
         ),
     ]
 
@@ -354,10 +407,8 @@ def _shaper(config: PrinterConfig) -> list[Fact]:
     if section not in config.sections:
         return [] if config.includes else [Fact(section, "", place, None)]
     rates = [option for option in config.sections[section] if option[:-1].endswith("_freq_")]
-    if "dual_carriage" in config.sections and not any(config.number(section, o) for o in rates):
-        # Newer Klippers take each carriage's shaper from SET_INPUT_SHAPER alone, in [delayed_gcode]
-        # (klippy/extras/input_shaper.py, 2026-08): what is in force is unknown, not off.
-        return []
+    if sets_shaper(config.texts) and not any(config.number(section, option) for option in rates):
+        return []  # what is in force is unknown, not off
     common = config.text(section, "shaper_type", "mzv")
     found = []
     for axis in "xy":
@@ -403,18 +454,17 @@ def _arcs(config: PrinterConfig) -> list[Fact]:
 
 
 def _macros(config: PrinterConfig) -> list[Fact]:
-    """Macros that would otherwise be taken for words of another firmware, or for Klipper's M204."""
-    named = {
-        section.partition("gcode_macro ")[2].strip().upper(): options
-        for section, options in config.sections.items()
-    }
-    macros = sorted(named.keys() & FOREIGN.keys())
-    body = named.get("M204", {}).get("gcode")
-    if body is not None and _HALVES.search(body.value):
-        macros = sorted([*macros, "M204"])
-    if not macros and config.includes:
-        return []
-    return [Fact("gcode_macro", "", "firmware.macros", macros)]
+    """Return macros that change how words of other firmwares are read, or M204."""
+    texts = config.texts
+    found = (
+        ("firmware.macros", other_macros(texts)),
+        ("firmware.limit_macros", limit_macros(texts)),
+    )
+    return [
+        Fact("gcode_macro", "", place, names)
+        for place, names in found
+        if names or not config.includes
+    ]
 
 
 def _elsewhere(includes: tuple[str, ...]) -> str:

@@ -164,6 +164,10 @@ class StreamCommands(Protocol):
         """Lines that restore the machine's stated shaper; None: it states none."""
 
     @property
+    def shaper_absent(self) -> bool:
+        """It was seen that the firmware has none; `shaper_off` may be there all the same."""
+
+    @property
     def file_shaper_off(self) -> bytes:
         """Lines that switch off a shaper set by the file, whatever the machine states."""
 

@@ -82,7 +82,7 @@ class ShaperSwitch:
             return b""
         self.is_off = self._advances = False
         stated, said = self._commands.shaper_on, self._by_file.lines.values()
-        if stated is None:
+        if stated is None and not self._commands.shaper_absent:
             set_again = [self._commands.shaped_axes(line) for line in said]
             self._left_off |= {"X", "Y"}.difference(*set_again)
         lines = (stated or b"") + b"".join(said)

@@ -63,6 +63,7 @@ class Extruder(Hotend):
     max_extrude_only_distance_mm: Positive = 50.0
     max_extrude_cross_section_mm2: Positive | None = None
     """None: Klipper's default, 4 nozzle_diameter^2."""
+    pressure_advance_smooth_time_s: NonNegative = 0.04
 
 
 class FirmwareShaper(Document):
@@ -98,14 +99,31 @@ class Klipper(FirmwareFacts):
     extruder: Extruder = Extruder()
     shaper: FirmwareShaper | None = None
     """None: unknown. It is switched off for our moves and stays off, and the report says so."""
+    no_input_shaper: bool = False
+    """printer.cfg was read whole and has no [input_shaper], so that the printer does not know
+    SET_INPUT_SHAPER, and no shaper is advised. Our moves switch it off all the same: it may have
+    been added since."""
     macros: tuple[str, ...] = ()
     """Configured macros with the name of another firmware's word, such as M205 or M900: they may do
-    anything. M205 also sets the corner velocity; M204 is named where it sets ACCEL_TO_DECEL to
-    half of its acceleration, too, as QIDI's does."""
-
+    anything. M203 and M205 also set what `limit_macros` says; M204 is named where it sets
+    ACCEL_TO_DECEL to half of its acceleration, too, as QIDI's does."""
+    macros_known: bool = False
+    """There are no other such macros: printer.cfg was read with all files that it includes."""
+    limit_macros: tuple[Literal["M203", "M205"], ...] = ()
+    """Such macros that do no more than set a limit, and are not among `macros`: M203 the speed (the
+    smaller of X and Y), M205 the corner velocity (X, or else Y)."""
     limits_capped: bool = False
     """SET_VELOCITY_LIMIT and M204 set no speed and no acceleration above those of `planner`, as on
     Elegoo's Centauri Carbon."""
+
+    @model_validator(mode="after")
+    def _one_shaper(self) -> Klipper:
+        if self.no_input_shaper and self.shaper is not None:
+            raise ValueError(
+                "shaper states a shaper, and no_input_shaper that printer.cfg has none: set "
+                "no_input_shaper to false, or leave shaper out"
+            )
+        return self
 
     @property
     def hotend(self) -> Hotend:

@@ -358,6 +358,7 @@ class _Job:
         warnings: Sequence[str],
     ) -> Result:
         machine, names = self._machine, asked.reader.feature_names
+        noted = [*self._notes, *asked.notes]
         before, shaper = original.channels()
         if self._before.is_on or any(label != OFF.label for label in asked.shapers):
             before = before.model_copy(update={"label": "as sliced, with the firmware's shaper"})
@@ -382,7 +383,7 @@ class _Job:
             peak_accel_mm_s2=max((f.accel_mm_s2 or 0.0 for f in figures.features), default=0.0),
             extruding_s=sum(group.seconds for group in features),
             warnings=[*self._doubts, *asked.warnings, *warnings, *advised.warnings()],
-            notes=[*self._withdrawn, *self._notes, *kept_beyond(figures.features), _UNDO],
+            notes=[*self._withdrawn, *noted, *kept_beyond(figures.features), _UNDO],
             layers=_merged(original.layers(), advised.layers()),
             features=features,
             track=advised.track(),

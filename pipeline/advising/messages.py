@@ -33,7 +33,8 @@ def shaper_warnings(
     if none_known:
         found.append(
             "No shaper is advised: this firmware takes none from a file, or the machine does "
-            "not say that it has one (firmware.shaper)."
+            "not say that it has one (firmware.shaper). Klipper takes one where printer.cfg has a "
+            "section [input_shaper], which may be empty: add it, and make the machine again."
         )
         if not stated:
             found.append(

@@ -28,6 +28,7 @@ from stillpath.service.api.uploads import receive_document, safe_name
 __all__ = ["router"]
 
 _LARGEST_BYTES = 4_000_000
+_LONGEST_UNREAD = 500
 _WANTED = "Klipper's printer.cfg, or Marlin's answer to M503"
 _BODY = {
     "requestBody": {
@@ -107,17 +108,23 @@ async def put_settings(
             )
         return marlin_settings.with_m503(before, text, file)
 
+    def stored() -> RevisionView:
+        message = edit.message or _message(text, file)
+        sources = [source_file(file, content)]
+        told = replace(edit, message=message)
+        return store_revision(request, response, name, caller, told, made, sources=sources)
+
     with as_problems():
-        return await run_in_threadpool(
-            store_revision,
-            request,
-            response,
-            name,
-            caller,
-            replace(edit, message=edit.message or f"from {file}"),
-            made,
-            sources=[source_file(file, content)],
-        )
+        return await run_in_threadpool(stored)
+
+
+def _message(text: str, file: str) -> str:
+    """Return what a revision is made from, and which files of a printer.cfg were not read."""
+    if marlin_settings.looks_like_m503(text):
+        return f"from {file}"
+    names = ", ".join(parse_printer_config(text, file, _WANTED).includes)
+    unread = "".join(filter(str.isprintable, names))[:_LONGEST_UNREAD]
+    return f"from {file}; not read, so unknown: {unread}" if unread else f"from {file}"
 
 
 def _new(text: str, file: str, name: str, given: _Given) -> Machine:

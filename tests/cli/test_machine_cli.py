@@ -8,12 +8,14 @@ from datetime import date, timedelta
 from pathlib import Path
 
 import pytest
+from pydantic import ValidationError
 
 from stillpath.applications.machines import transfer
 from stillpath.applications.machines.checks import check_before_job, differences
 from stillpath.applications.machines.klipper_config import read_printer_config
 from stillpath.applications.machines.store import MachineStore
 from stillpath.cli.main import run
+from stillpath.models.firmware import Klipper
 from stillpath.models.machine import CommandLimits, Machine, MotorLimits
 from stillpath.models.store import builtin_machines
 from tests.cli.test_cli import compensate, one_line, pipeline, source
@@ -292,6 +294,7 @@ def test_a_machine_from_a_printer_cfg(store: MachineStore, config: Path, capsys)
     assert machine.pressure_advance_s == 0.04
     assert machine.firmware.arc_resolution_mm == 0.1
     assert machine.firmware.macros == ("M900",)
+    assert not machine.firmware.macros_known  # of mainsail.cfg
     shaper = machine.firmware.shaper
     assert shaper is not None
     assert (shaper.type_x, shaper.freq_x_hz, shaper.type_y) == ("ei", 61.2, "2hump_ei")
@@ -340,6 +343,14 @@ def test_a_firmware_that_caps_limits_is_recognised(store: MachineStore, config: 
     )
     assert "max_velocity_silent" in found.text
     assert "firmware.limits_capped" in found.text
+    # Its M900 stops the head; users name others besides.
+    assert machine.firmware.stopping_macros == ("M900",)
+    for names, told in ((("_WAIT", "m900"), 0), (("_WAIT",), 1)):
+        other = machine.firmware.model_copy(update={"stopping_macros": names})
+        other = machine.model_copy(update={"firmware": other})
+        texts = [entry.text for entry in differences(other, read_printer_config(config))]
+        assert len(texts) == told
+        assert all("the printer has M900, the machine _WAIT" in text for text in texts)
 
 
 def test_a_fork_that_keeps_its_shaper_elsewhere(store: MachineStore, config: Path, capsys):
@@ -375,16 +386,11 @@ def test_an_option_that_older_klippers_understand_otherwise(
     planner = machine.firmware.planner
     assert planner.max_accel_to_decel_mm_s2 == (1000.0 if told else None)
     assert differences(machine, read_printer_config(config)) == []
-    # Such a Klipper stops at each; users name others besides.
-    stops = ("SET_PRESSURE_ADVANCE",) if told else ()
-    assert machine.firmware.stopping_macros == stops
-    more_stops = machine.firmware.model_copy(update={"stopping_macros": ("_WAIT", *stops)})
-    machine = machine.model_copy(update={"firmware": more_stops})
+    # The planner's limit says that it stops at each SET_PRESSURE_ADVANCE, too.
+    assert machine.firmware.stopping_macros == ()
+    named = machine.firmware.model_copy(update={"stopping_macros": ("SET_PRESSURE_ADVANCE",)})
+    machine = machine.model_copy(update={"firmware": named})
     assert differences(machine, read_printer_config(config)) == []
-    fewer = machine.firmware.model_copy(update={"stopping_macros": ()})
-    machine = machine.model_copy(update={"firmware": fewer})
-    found = differences(machine, read_printer_config(config))
-    assert [entry.place for entry in found] == ["firmware.stopping_macros"] * bool(told)
 
 
 @pytest.mark.parametrize("height_mm", [0.0, 0.4])
@@ -407,6 +413,26 @@ def test_limits_by_axis_of_a_fork_are_told_apart(store: MachineStore, config: Pa
     for words in ("limited_corexy", "kinematics: corexy", "max_accel: 3000", "max_x_accel"):
         assert words in told
     assert "heavy" not in store.names()
+
+
+def test_constants_of_a_fork(store: MachineStore, config: Path):
+    """Kalico's: an option may refer to one of another section, or of its own."""
+    constants = "[constants]\nTop_Speed: 300\nkind: core${constants.plane}\nplane: xy\n"
+    text = CONFIG.replace("max_velocity: 300", "max_velocity: ${constants.Top_Speed}")
+    text = text.replace("kinematics: corexy", "kinematics: ${constants.kind}")
+    text = text.replace("position_min: -2", "position_min: -${inset}\ninset: 2")
+    assert text.count("${") == 3
+    config.write_text(constants + text)
+    assert machines("from-config", config, "--name", "mine") == 0
+    machine = store.current("mine").machine
+    assert machine.firmware.fastest_mm_s == 300.0
+    assert (machine.kinematics, machine.travel["x"].min_mm) == ("corexy", -2.0)
+    assert machine.firmware.stopping_macros == ("SET_PRESSURE_ADVANCE",)
+    assert differences(machine, read_printer_config(config)) == []
+    config.write_text(f"[danger_options]\nlog_statistics: False\n{CONFIG}")
+    assert machines("from-config", config, "--name", "other") == 0
+    firmware = store.current("other").machine.firmware
+    assert firmware.stopping_macros == ("SET_PRESSURE_ADVANCE",)
 
 
 def test_typed_in_resonances(store: MachineStore, config: Path):
@@ -466,6 +492,58 @@ def test_the_shaper_of_two_carriages_is_unknown(store: MachineStore, config: Pat
     assert "shaper_freq_x" in [difference.option for difference in found]
 
 
+@pytest.mark.parametrize(
+    ("more", "known"),
+    [
+        ("[tool T0]\nafter_change_gcode:\n  M117\n  set_input_shaper SHAPER_FREQ_X=50\n", False),
+        ("[tool T0]\nparams_input_shaper_freq_x: 50\n", False),
+        ("[delayed_gcode a]\ngcode:\n  {% if 1 %}\n  SET_INPUT_SHAPER SHAPER_FREQ_X=50\n", False),
+        ("[gcode_macro STILLPATH_SHAPER_ON]\ngcode:\n  SET_INPUT_SHAPER SHAPER_FREQ_X=0\n", True),
+    ],
+)
+def test_the_shaper_of_a_tool_changer_is_unknown(
+    store: MachineStore, config: Path, more: str, known: bool
+):
+    """Its macros set each tool's: off behind a stretch is not what was in force."""
+    plain = CONFIG.partition("[input_shaper]")[0]
+    config.write_text(f"{plain}[input_shaper]\n{more}")
+    assert machines("from-config", config, "--name", "mine") == 0
+    machine = store.current("mine").machine
+    assert machine.firmware.kind == "klipper"
+    assert (machine.firmware.shaper is not None) is known
+    assert differences(machine, read_printer_config(config)) == []
+    config.write_text(f"{plain}[input_shaper]\nshaper_freq_y: 40\n{more}")
+    assert machines("from-config", config, "--name", "stated") == 0
+    firmware = store.current("stated").machine.firmware
+    assert firmware.kind == "klipper"
+    assert firmware.shaper is not None
+
+
+def test_a_printer_without_a_shaper(store: MachineStore, config: Path):
+    whole = CONFIG.replace("[include mainsail.cfg]", "")
+    plain = whole.partition("[input_shaper]")[0]
+    texts = {"with": whole, "without": plain, "unread": f"[include mainsail.cfg]\n{plain}"}
+    made = {}
+    for name, text in texts.items():
+        config.write_text(text)
+        assert machines("from-config", config, "--name", name) == 0
+        made[name] = store.current(name).machine
+        firmware = made[name].firmware
+        assert firmware.kind == "klipper"
+        assert firmware.no_input_shaper is (name == "without")
+        assert differences(made[name], read_printer_config(config)) == []
+        # A machine from before this was noted does not differ from its printer.
+        before = firmware.model_copy(update={"no_input_shaper": False})
+        machine = made[name].model_copy(update={"firmware": before})
+        assert differences(machine, read_printer_config(config)) == []
+    config.write_text(whole)  # now it has one
+    found = differences(made["without"], read_printer_config(config))
+    assert "shaper_freq_x" in [entry.option for entry in found]
+    section = made["without"].firmware.model_dump(mode="json")
+    with pytest.raises(ValidationError, match="set no_input_shaper to false"):
+        Klipper.model_validate({**section, "shaper": {}})
+
+
 @pytest.mark.parametrize("hertz", ["inf", "nan", "1e101", "501"])
 def test_resonances_that_are_none(store: MachineStore, config: Path, capsys, hertz: str):
     assert machines("from-config", config, "--name", "mine", "--fx", hertz) == 2
@@ -491,10 +569,17 @@ def test_resonances_that_are_none(store: MachineStore, config: Path, capsys, her
             "filament_diameter: 0",
             ["[extruder] filament_diameter: 0 must be above 0"],
         ),
+        ("kinematics: corexy", "", ["[printer] lacks kinematics", "mainsail.cfg", "cat them"]),
         ("max_accel = 4000", "", ["[printer] lacks max_accel", "mainsail.cfg", "was not read"]),
         ("kinematics: corexy", "kinematics: delta", ["kinematics delta: only", "as sliced"]),
         ("[stepper_z]", "[stepper_q]", ["travel", "z"]),
         ("position_max: 250", "position_max: -9", ["travel", "-2.0", "-9.0"]),
+        (
+            "max_velocity: 300",
+            "max_velocity: ${constants.speed}",
+            ["line 6: [printer] max_velocity: ${constants.speed} refers to speed of [constants]"],
+        ),
+        ("max_velocity: 300", "max_velocity: ${max_velocity}", ["'${max_velocity}' is no number"]),
         ("type_x: ei", "type_x: foo", ["[input_shaper] shaper_type_x", "'foo'", "give zv, mzv"]),
     ],
 )
@@ -542,6 +627,11 @@ def test_included_files_are_read_as_klipper_reads_them(store: MachineStore, tmp_
     assert "note: [include" not in capsys.readouterr().out
     made = store.current("mine")
     assert made.machine.firmware.macros == ("M205", "M900")
+    assert made.machine.firmware.macros_known
+    # Machines from before that was noted do not differ, and keep their revision.
+    before = made.machine.firmware.model_copy(update={"macros_known": False})
+    machine = made.machine.model_copy(update={"firmware": before})
+    assert differences(machine, read_printer_config(config)) == []
     planner, travel = made.machine.firmware.planner, made.machine.travel
     assert (planner.max_accel_mm_s2, planner.max_velocity_mm_s) == (4000.0, 250.0)
     assert made.machine.firmware.arc_resolution_mm == 0.1
@@ -555,7 +645,12 @@ def test_included_files_are_read_as_klipper_reads_them(store: MachineStore, tmp_
 
 @pytest.mark.parametrize(
     ("line", "macros"),
-    [("ACCEL_TO_DECEL={s/2}", ("M204", "M900")), ("ACCEL_TO_DECEL={s}", ("M900",))],
+    [
+        ("ACCEL_TO_DECEL={s/2}", ("M204", "M900")),
+        ("ACCEL_TO_DECEL={s*0.5}", ("M204", "M900")),
+        ("ACCEL_TO_DECEL={s*0.55}", ("M900",)),
+        ("ACCEL_TO_DECEL={s}", ("M900",)),
+    ],
 )
 def test_a_macro_m204_that_halves(store: MachineStore, config: Path, line: str, macros):
     """As in QIDI's gcode_macro.cfg; Creality's passes M204 on."""
@@ -564,6 +659,55 @@ def test_a_macro_m204_that_halves(store: MachineStore, config: Path, line: str, 
     config.write_text(f"{macro}    SET_VELOCITY_LIMIT {line}\n{CONFIG}")
     assert machines("from-config", config, "--name", "mine") == 0
     assert store.current("mine").machine.firmware.macros == macros
+
+
+CORNER_OR = """
+  {% if 'X' in params %}
+    SET_VELOCITY_LIMIT SQUARE_CORNER_VELOCITY={params.X}
+  {% elif 'Y' in params %}
+    SET_VELOCITY_LIMIT SQUARE_CORNER_VELOCITY={params.Y}
+  {% endif %}
+"""
+CORNER_MIN = """
+  {% if 'X' in params or 'Y' in params %}
+    SET_VELOCITY_LIMIT SQUARE_CORNER_VELOCITY="{
+      (params.X|default(0)|float, params.Y|default(0)|float)|min}"
+  {% else %}
+    SET_VELOCITY_LIMIT
+  {% endif %}
+"""
+SPEED = """
+    {% set velocity = (params.X|default(params.Y)|float,
+                       params.Y|default(params.X)|float)|min %}
+    SET_VELOCITY_LIMIT VELOCITY="{velocity}"
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "body", "only"),
+    [
+        ("M205", CORNER_OR, True),
+        ("M205", CORNER_MIN, True),
+        ("M203", SPEED, True),
+        ("M203", CORNER_OR, False),
+        ("M205", CORNER_OR + "    M400\n", False),
+        ("M205", CORNER_OR.replace("params.X}", "params.X|float / 2}"), False),
+        ("M205", CORNER_OR + "    # long\n    SET_VELOCITY_LIMIT\n" * 250, False),
+        ("M205", " M400", False),
+    ],
+)
+def test_a_macro_that_only_sets_a_limit(
+    store: MachineStore, config: Path, name: str, body: str, only: bool
+):
+    """Creality's and Elegoo's: streams need not end before it."""
+    config.write_text(f"[gcode_macro {name}]\ndescription: a\ngcode:{body}\n{CONFIG}")
+    assert machines("from-config", config, "--name", "mine") == 0
+    machine = store.current("mine").machine
+    firmware = machine.firmware
+    assert firmware.kind == "klipper"
+    limits, macros = firmware.limit_macros, firmware.macros
+    assert (limits, macros) == (((name,), ("M900",)) if only else ((), (name, "M900")))
+    assert differences(machine, read_printer_config(config)) == []
 
 
 def test_a_configuration_that_includes_itself(tmp_path: Path, capsys):
@@ -578,6 +722,7 @@ def test_a_configuration_that_includes_itself(tmp_path: Path, capsys):
     ("old", "new", "line"),
     [
         ("max_accel = 4000", "max_accel = 5000", "[printer] max_accel: the printer has 5000, the"),
+        ("advance = 0.04", "advance_smooth_time = .03", "smooth_time: the printer has 0.03, the m"),
         ("advance = 0.04", "advance = 0.05", "[extruder] pressure_advance: the printer has 0.05"),
         ("freq_x = 61.2", "freq_x = 58", "[input_shaper] shaper_freq_x: the printer has 58, the"),
         ("type_x: ei", "type_x: mzv (n=4, t=1.0)", "shaper_type_x: the printer has mzv(n=4,t=1.0)"),

@@ -729,20 +729,48 @@ def test_a_word_that_printers_have_as_a_macro_is_told(read) -> None:
     text = "M205 X8\nG1 X5 Y5 F600\nM205 X500\nG1 X9\nM205 X50\n"  # the first one at the start
     block, interpreter = read(text, "klipper", homed_at_start=False)
     assert block.events.kind.tolist() == [EventKind.HARMLESS] * 3
-    (said,) = interpreter.warnings
-    assert said.startswith("line 3: M205 in the middle of the print")
-    named = ({"macros": ("M205",)}, {"harmless_macros": ("M205",)}, {"unknown_commands": "skip"})
-    assert all(read(text, "klipper", **fields)[1].warnings == [] for fields in named)
+    ((said, line),) = interpreter.state.notes.items()
+    assert (line, interpreter.warnings) == (3, [])
+    assert said.startswith("M205 in the middle of the print")
+    for fields in (
+        {"macros": ("M205",)},
+        {"harmless_macros": ("M205",)},
+        {"unknown_commands": "skip"},
+        {"macros_known": True},
+    ):
+        assert read(text, "klipper", **fields)[1].state.notes == {}
+    # It may be a command, of which printer.cfg says nothing.
+    advance = text.replace("M205 X", "M900 K")
+    assert len(read(advance, "klipper", macros_known=True)[1].state.notes) == 1
 
 
 @pytest.mark.parametrize(
-    ("line", "corner_mm_s"), [("M205 X20 Y15", 20.0), ("M205 Y15", 15.0), ("M205 B1", 5.0)]
+    ("line", "limits"),
+    [
+        ("M205 X20 Y15", (500.0, 20.0)),
+        ("M205 Y15", (500.0, 15.0)),
+        ("M205 B1", (500.0, 5.0)),
+        ("M203 X200 Y150 Z5", (150.0, 5.0)),
+        ("M203 X200", (200.0, 5.0)),
+        ("M203 E25", (500.0, 5.0)),
+        ("M203 X0", (500.0, 5.0)),
+    ],
 )
-def test_a_macro_m205_sets_the_corner_velocity(read, line: str, corner_mm_s: float) -> None:
-    """As those of Creality do, whose files have it at each feature; and like any macro may move."""
-    block, _ = read(f"G1 X5 F600\n{line}\nG1 X9\n", "klipper", macros=("m205",))
-    assert block.limits[block.events.limits_id[-1]].square_corner_velocity_mm_s == corner_mm_s
-    assert block.events.kind.tolist() == [EventKind.UNKNOWN]
+def test_a_macro_that_sets_a_limit(read, line: str, limits: tuple[float, float]) -> None:
+    """As those of Creality and Elegoo do, whose files have them at each feature.
+
+    One that only does so is held back within a stream; of another nothing more is known.
+    """
+    name, text = line[:4], f"G1 X5 F600\n{line}\nG1 X9\n"
+    for fields, kind in (
+        ({"macros": (name.lower(),)}, EventKind.UNKNOWN),
+        ({"limit_macros": (name,)}, EventKind.LIMITS),
+    ):
+        block, interpreter = read(text, "klipper", **fields)
+        after = block.limits[block.events.limits_id[-1]]
+        assert (after.velocity_mm_s, after.square_corner_velocity_mm_s) == limits
+        assert block.events.kind.tolist() == [kind]
+        assert interpreter.state.notes == {}
 
 
 def test_a_macro_m204_halves_what_short_moves_may_have(read) -> None:

@@ -9,7 +9,7 @@ from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.types import EventKind, ProgramBlock
-from stillpath.models.firmware.klipper import PlannerLimits
+from stillpath.models.firmware.klipper import Extruder, PlannerLimits
 from stillpath.models.machine import Machine
 from tests.gcode.cutting import blocks_of
 
@@ -285,14 +285,54 @@ def test_classes(wary_machine: Machine) -> None:
     assert block.events.dwell_s.sum() == pytest.approx(0.2 + 0.021 + 0.04)
 
 
+@pytest.mark.parametrize("smooth_s", [0.02, 0.04])
+def test_klipper_stands_for_the_stated_smooth_time(golden_machine: Machine, smooth_s: float):
+    """Creality's have 0.02, and a file that adapts pressure advance stops thousands of times."""
+    extruder = Extruder(pressure_advance_smooth_time_s=smooth_s)
+    facts = {"extruder": extruder, "stopping_macros": ("SET_PRESSURE_ADVANCE",)}
+    firmware = golden_machine.firmware.model_copy(update=facts)
+    machine = golden_machine.model_copy(update={"firmware": firmware, "pressure_advance_s": 0.05})
+    for line, dwell_s in (("ADVANCE=.06", smooth_s), ("SMOOTH_TIME=.1", 0.5 * smooth_s + 0.05)):
+        block = run(f"G1 X5 F600\nSET_PRESSURE_ADVANCE {line}\nG1 X9\n", machine)
+        assert block.events.dwell_s.sum() == pytest.approx(dwell_s)
+
+
+@pytest.mark.parametrize(
+    ("between", "dwell_s"), [("", 0.04), ("G4 P100\n", 0.14), ("G1 E-1\nG1 E1\n", 0.08)]
+)
+def test_klipper_flushes_once_at_a_rest(golden_machine: Machine, between: str, dwell_s: float):
+    machine = golden_machine.model_copy(update={"pressure_advance_s": 0.05})
+    lines = ("SET_INPUT_SHAPER SHAPER_FREQ_X=40\n", "SET_INPUT_SHAPER SHAPER_FREQ_Y=40\n")
+    block = run(f"M83\nG1 X5 F600\n{between.join(lines)}G1 X9\n", machine)
+    assert block.events.dwell_s.sum() == pytest.approx(dwell_s)
+
+
+@pytest.mark.parametrize("to_decel_mm_s2", [None, 1000.0])
+def test_a_newer_klipper_looks_ahead_as_before_the_first(
+    golden_machine: Machine, to_decel_mm_s2: float | None
+):
+    """Its motion queuing knows how far it has to flush from the last move alone."""
+    planner = golden_machine.firmware.planner.model_copy(
+        update={"max_accel_to_decel_mm_s2": to_decel_mm_s2}
+    )
+    firmware = golden_machine.firmware.model_copy(update={"planner": planner})
+    update = {"firmware": firmware, "pressure_advance_s": 0.0}
+    machine = golden_machine.model_copy(update=update)
+    stands = {}
+    for kinds in (("60",), ("20",), ("60", "20")):
+        lines = "".join(f"SET_INPUT_SHAPER SHAPER_TYPE=zv SHAPER_FREQ_X={f}\n" for f in kinds)
+        stands[kinds] = float(run(f"G1 X5 F600\n{lines}G1 X9\n", machine).events.dwell_s.sum())
+    before_s = 1e-3 if to_decel_mm_s2 is None else stands["60",] - 1e-3
+    assert stands["60", "20"] == pytest.approx(before_s + stands["20",] - 1e-3)
+
+
 def test_a_shaper_with_much_damping_makes_klipper_stand_longer(golden_machine: Machine) -> None:
     """ZV: the second pulse comes half a damped period later, and the middle lies nearer to it."""
     machine = golden_machine.model_copy(update={"pressure_advance_s": 0.0})
     stands = {}
     for damping in (0.05, 0.1, 0.3):
         line = f"SET_INPUT_SHAPER SHAPER_TYPE=zv SHAPER_FREQ_X=40 DAMPING_RATIO_X={damping}\n"
-        of_host = run("SET_INPUT_SHAPER SHAPER_FREQ_X=0 SHAPER_FREQ_Y=0\n" + line, machine)
-        stands[damping] = float(of_host.events.dwell_s[1])
+        stands[damping] = float(run(line, machine).events.dwell_s[0])
         bent = np.sqrt(1.0 - damping**2)
         ahead_s = 0.5 / 40.0 / bent / (1.0 + np.exp(-np.pi * damping / bent))
         assert stands[damping] == pytest.approx(1e-3 + ahead_s, abs=1e-9)

@@ -196,16 +196,19 @@ def test_shaper_of_the_machine_is_restored(
     assert not any("shaper" in warning for warning in pipeline.result.warnings)
 
 
-@pytest.mark.parametrize("further", ["", " Z_ACCEL=300"])
+_CORNER = "SET_VELOCITY_LIMIT SQUARE_CORNER_VELOCITY=5"
+
+
+@pytest.mark.parametrize("corner", [f"{_CORNER}\n", f"{_CORNER} Z_ACCEL=300\n", "M205 X5 Y5\n"])
 def test_the_shaper_is_not_switched_for_travel(
-    pipeline: Pipeline, machine: Machine, further: str
+    pipeline: Pipeline, machine: Machine, corner: str
 ) -> None:
     """Klipper stands still for every SET_INPUT_SHAPER: times say how long, and there are few."""
     shaper = FirmwareShaper(type_x="ei(0.05)", freq_x_hz=51.5, type_y="mzv", freq_y_hz=39)
-    firmware = machine.firmware.model_copy(update={"shaper": shaper})
+    facts = {"shaper": shaper, "limit_macros": ("M205",)}
+    firmware = machine.firmware.model_copy(update=facts)
     known = machine.model_copy(update={"firmware": firmware, "pressure_advance_s": 0.05})
     # As Orca writes for each feature.
-    corner = f"SET_VELOCITY_LIMIT SQUARE_CORNER_VELOCITY=5{further}\n"
     marks = f"EXCLUDE_OBJECT_END NAME=a\n{corner}EXCLUDE_OBJECT_START NAME=a\nG1 X130 Y90 F9000\n"
     text = HEAD + ROUND + 5 * (marks + ROUND) + "G28\n"
     written = pipeline(text, known)

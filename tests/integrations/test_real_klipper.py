@@ -128,6 +128,25 @@ def test_the_host_stands_for_the_smooth_time_of_pressure_advance(tmp_path: Path)
     assert max(found.largest.values()) < 1e-6
 
 
+@pytest.mark.parametrize(
+    "lines",
+    [
+        "SET_INPUT_SHAPER SHAPER_FREQ_X=40\nSET_INPUT_SHAPER SHAPER_FREQ_Y=30\n",
+        "SET_INPUT_SHAPER SHAPER_FREQ_X=20\nM204 S900\nSET_INPUT_SHAPER SHAPER_FREQ_X=60\n",
+        "SET_INPUT_SHAPER SHAPER_FREQ_X=40\nG4 P100\nSET_PRESSURE_ADVANCE ADVANCE=.03\n",
+        "SET_INPUT_SHAPER SHAPER_FREQ_X=40\nG1 E-1\nG1 E1\nSET_INPUT_SHAPER SHAPER_FREQ_Y=30\n",
+    ],
+)
+def test_the_host_stands_once_for_lines_at_one_rest(lines: str, tmp_path: Path) -> None:
+    machine = of_the_package(homed(load_machine("ender3")))
+    shaper = FirmwareShaper(freq_x_hz=57.8, freq_y_hz=45.2)
+    firmware = machine.firmware.model_copy(update={"shaper": shaper})
+    machine = machine.model_copy(update={"firmware": firmware})
+    text = f"G28\nG90\nM83\nG1 X10 Y10 Z5 F3000\nG1 X50 E1\n{lines}G1 X100 E1\n"
+    steps_of(text, printer_cfg(machine, shaper=True), tmp_path)
+    assert compared(text, machine, recorded(tmp_path)).stand_s < 1e-6
+
+
 def test_the_host_of_before_the_cruise_ratio(tmp_path: Path) -> None:
     """Its max_accel_to_decel stays as it is where a file sets ACCEL, and follows ACCEL_TO_DECEL."""
     machine = of_the_package(homed(load_machine("ender3")))

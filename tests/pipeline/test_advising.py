@@ -269,6 +269,17 @@ def test_the_printers_shaper_is_put_back(tmp_path: Path, cache: Path) -> None:
 
 
 @pytest.mark.slow
+def test_without_a_section_input_shaper_none_is_advised(tmp_path: Path, cache: Path) -> None:
+    """Such a Klipper passes over SET_INPUT_SHAPER, and would ring under the accelerations."""
+    machine = machine_of(Klipper(no_input_shaper=True))
+    result, written = advise(printed(), tmp_path, machine, cache, budget_um=60.0)
+    assert b"SET_INPUT_SHAPER" not in written
+    assert result.advice is not None
+    assert result.advice.shapers == []
+    assert any("section [input_shaper], which may be empty" in line for line in result.warnings)
+    assert not any("own shaper is not known" in line for line in result.warnings)
+
+
 def test_frequencies_follow_the_mass(tmp_path: Path, cache: Path) -> None:
     mass = MassSchedule(moving_mass_kg=0.002, filament_density_g_cm3=1.24)
     machine = machine_of(Klipper(), schedules={"y": AxisSchedule(mass=mass)})

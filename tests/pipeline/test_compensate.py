@@ -33,7 +33,7 @@ from stillpath.pipeline.options import Options
 from stillpath.pipeline.piece_compensator import PieceCompensator, Unfit
 from stillpath.pipeline.progress import Progress, StopWork
 from stillpath.pipeline.result import ErrorFigures, Result
-from stillpath.pipeline.simulate import plan_file
+from stillpath.pipeline.simulate import plan_file, simulate_file
 from stillpath.simulation.measures import contour_error
 from stillpath.simulation.response import response
 from tests.compensating import compensated
@@ -467,3 +467,32 @@ def test_a_start_macro_whose_limits_would_be_lost(
     assert [note.partition("If ")[2].partition(" or another")[0] for note in found] == (
         [name] if name else []
     )
+
+
+@pytest.mark.parametrize("absent", [False, True])
+def test_a_printer_without_a_shaper(tmp_path: Path, cache: Path, absent: bool) -> None:
+    """It is switched off all the same, as one may have been added since."""
+    machine = load_machine("ender3")
+    facts = machine.firmware.model_copy(update={"no_input_shaper": absent})
+    machine = machine.model_copy(update={"firmware": facts})
+    result, written = compensated(SMALL, tmp_path, cache, machine, robust="off")
+    assert written.count(b"SET_INPUT_SHAPER SHAPER_FREQ_X=0 SHAPER_FREQ_Y=0") == 1
+    assert any("own input shaper is not known" in line for line in result.warnings) is not absent
+    assert any("had no [input_shaper]" in line for line in result.notes) is absent
+
+
+def test_a_word_that_may_be_a_macro_is_a_note(tmp_path: Path, cache: Path) -> None:
+    """Cura writes M205 into every file for Marlin, and most Klippers pass over it."""
+    file, machine = SMALL.replace(b"G1 X120", b"M205 X8 Y8\nG1 X120"), load_machine("ender3")
+    facts = machine.firmware.model_copy(update={"macros_known": True})
+    for made in (machine, machine.model_copy(update={"firmware": facts})):
+        result, _ = compensated(file, tmp_path, cache, made, robust="off")
+        assert not any("M205" in line for line in result.warnings)
+        told = sum("M205 in the middle" in line for line in result.notes)
+        assert told == (made is machine)
+        seen = simulate_file(tmp_path / "in.gcode", made, cache_dir=cache)
+        assert sum("M205 in the middle" in line for line in seen.notes) == told
+        planned = plan_file(tmp_path / "in.gcode", tmp_path / "plan.npz", made)
+        assert sum("M205 in the middle" in line for line in planned.warnings) == told
+        (tmp_path / "plan.npz").unlink()
+        (tmp_path / "out.gcode").unlink()

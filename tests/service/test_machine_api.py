@@ -277,6 +277,9 @@ def test_a_machine_of_a_printer_cfg(client: TestClient):
     assert machine["axes"]["x"]["nominal"]["modes"][0]["f_hz"] == 51
     answer = settings(client, CONFIG, {"If-Match": made.headers["etag"]})
     assert_problem(answer, 422, "give another name")
+    # What it includes does not come along: the history says what is unknown.
+    unread = "; not read, so unknown: mainsail.cfg"
+    assert made.json()["message"] == f"from printer.cfg{unread}"
 
 
 @pytest.mark.parametrize(

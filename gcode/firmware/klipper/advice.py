@@ -11,7 +11,7 @@ from stillpath.gcode.lexer import extended_parameters, split_line
 from stillpath.gcode.types import Limits
 from stillpath.models.firmware import Klipper
 from stillpath.models.shaper_pulses import SHAPERS
-from stillpath.models.shaping import AxisShaper, Shaping
+from stillpath.models.shaping import OFF, AxisShaper, Shaping
 
 __all__ = ["KlipperAdviser"]
 
@@ -23,7 +23,6 @@ class KlipperAdviser:
     exists where printer.cfg has a section [input_shaper], which may be empty.
     """
 
-    shapers = SHAPERS
     shaper_word = "SET_INPUT_SHAPER"
     same_for_both = False
     skips_lines = False
@@ -33,7 +32,8 @@ class KlipperAdviser:
         self._dialect = dialect
         self.highest_mm_s2 = firmware.planner.max_accel_mm_s2
         s = firmware.shaper
-        self.stated: Shaping | None = None
+        self.shapers: tuple[str, ...] = () if firmware.no_input_shaper else SHAPERS
+        self.stated: Shaping | None = OFF if firmware.no_input_shaper else None
         if s is not None:
             self.stated = Shaping(
                 AxisShaper(s.type_x, s.freq_x_hz, s.damping_x),

@@ -14,13 +14,14 @@ from stillpath.gcode import _slots as at
 from stillpath.gcode.lexer import Command
 from stillpath.gcode.state import MachineState, Saved
 from stillpath.gcode.types import EventKind
+from stillpath.models.firmware import Klipper
 
 __all__ = [
     "acceleration",
     "activate_extruder",
-    "corner_macro",
     "exclude_object",
     "gcode_offset",
+    "limit_macro",
     "perhaps_macro",
     "reset_velocity_limit",
     "restore_state",
@@ -45,6 +46,8 @@ _LIMITS: dict[str, tuple[str, Callable[[float], bool], str]] = {
 """Parameters of SET_VELOCITY_LIMIT: what they set, which values are allowed, and that in words."""
 _CAPPED = ("velocity_mm_s", "accel_mm_s2")
 _MOST_STATES = 1000
+_COMMANDS = ("M593", "M900")
+"""Words of other firmwares that some forks have as commands, of which printer.cfg says nothing."""
 
 
 def velocity_limit(state: MachineState, command: Command, *, capped: bool = False) -> int:
@@ -73,13 +76,18 @@ def velocity_limit(state: MachineState, command: Command, *, capped: bool = Fals
 def perhaps_macro(state: MachineState, command: Command) -> int:
     """Another firmware's word, which Klipper passes over; many printers have a macro for it.
 
+    Where the macros are known it is none, but M900 may be a command.
+
     Creality's M205 sets the corner velocity, their M900 pressure advance, and the M300 of Klipper's
     own examples waits (CrealityOfficial/K1_Series_Klipper, config/*/gcode_macro.cfg, 2024;
     Klipper3d/klipper, config/printer-sunlu-t3-2022.cfg, 2026-08). Anycubic's and Elegoo's Klippers
-    have M900 as a command (ANYCUBIC-3D/Kobra3, elegooofficial/CentauriCarbon, 2025).
+    have M900 as a command, Elegoo's M593 too (ANYCUBIC-3D/Kobra3, elegooofficial/CentauriCarbon,
+    2025).
     """
-    if state.i[at.I_KNOWN] & 3 == 3 and state.firmware.unknown_commands != "skip":
-        state.warn(
+    facts = state.firmware
+    known = isinstance(facts, Klipper) and facts.macros_known and command.name not in _COMMANDS
+    if state.i[at.I_KNOWN] & 3 == 3 and facts.unknown_commands != "skip" and not known:
+        state.note(
             f"{command.name} in the middle of the print: Klipper passes over it, but if yours has "
             "a macro or a command of that name, as many makers' printers have, it sets limits or "
             f"waits in the middle of a stream; put {command.name} among the machine's macros "
@@ -88,18 +96,24 @@ def perhaps_macro(state: MachineState, command: Command) -> int:
     return state.event(EventKind.HARMLESS)
 
 
-def corner_macro(state: MachineState, command: Command) -> int:
-    """M205 where the machine names a macro of it: the corner velocity becomes X, or else Y.
+def limit_macro(state: MachineState, command: Command, *, kind: EventKind) -> int:
+    """M203 and M205 where the machine names a macro of it: the speed, and the corner velocity.
 
-    So do all of 79 printers' that were looked at (Creality's K1, K2 and Ender-3 V3, Elegoo's
-    Neptune 4, Klippain; 2023 to 2026). As any macro it may do more.
+    M203 sets the smaller of X and Y, M205 X, or else Y. So do all of 79 printers' that were looked
+    at (Creality's K1, K2 and Ender-3 V3, Elegoo's Neptune 4, Klippain; 2023 to 2026), and no more.
+    One whose body is not known (kind UNKNOWN) may do more, as any macro.
     """
     given = state.numbers(command, "XY")
-    corner_mm_s = given.get("X", given.get("Y", -1.0))
-    values = {"square_corner_velocity_mm_s": corner_mm_s} if corner_mm_s >= 0.0 else {}
-    state.settle()
-    state.macro_ran = True
-    return state.set_limits(command, values, kind=EventKind.UNKNOWN)
+    values = {}
+    if command.name == "M203":
+        speed_mm_s = min(given.values(), default=0.0)
+        values = {"velocity_mm_s": speed_mm_s} if speed_mm_s > 0.0 else {}
+    elif (corner_mm_s := given.get("X", given.get("Y", -1.0))) >= 0.0:
+        values = {"square_corner_velocity_mm_s": corner_mm_s}
+    if kind == EventKind.UNKNOWN:
+        state.settle()
+        state.macro_ran = True
+    return state.set_limits(command, values, kind=kind)
 
 
 def reset_velocity_limit(state: MachineState, _command: Command) -> int:

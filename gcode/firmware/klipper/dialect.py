@@ -131,8 +131,13 @@ FOREIGN: dict[str, Word] = {
     **words("M201 M203 M205 M300 M572 M593 M900", commands.perhaps_macro),
 }
 
-MACROS: dict[str, Word] = {"M205": commands.corner_macro}
+MACROS: dict[str, Word] = {
+    name: partial(commands.limit_macro, kind=EventKind.UNKNOWN) for name in ("M203", "M205")
+}
 """What is known of macros with another firmware's word for a name, if a machine names them."""
+LIMIT_MACROS: dict[str, Word] = {
+    name: partial(commands.limit_macro, kind=EventKind.LIMITS) for name in MACROS
+}
 
 _NAME = re.compile(r"^[A-Z_][A-Z0-9_.]*$")
 
@@ -161,6 +166,7 @@ def klipper(firmware: Klipper) -> Dialect:
         **({} if firmware.retraction else NO_RETRACTION),
         **FOREIGN,
         **{name: MACROS.get(name, EventKind.UNKNOWN) for name in sorted(macros)},
+        **{str(name): LIMIT_MACROS[name] for name in firmware.limit_macros},
         **NATIVE,
         **{name.upper(): EventKind.STOP for name in firmware.stopping_macros},
         **{name.upper(): EventKind.HARMLESS for name in firmware.harmless_macros},

@@ -2,10 +2,12 @@
 
 Steps are generated ahead of their motion, by the look-ahead of input shaper and pressure advance.
 SET_INPUT_SHAPER flushes them all: the next move starts later by the look-ahead before the command
-plus that after it. So does a SET_PRESSURE_ADVANCE that changes the time over which the extruder's
-speed is averaged, which is 0 without pressure advance. Klipper before 2025-09-03, and Kalico, flush
-for every SET_PRESSURE_ADVANCE: their machines name it among their ``stopping_macros``, or have a
-``max_accel_to_decel_mm_s2``, which only a Klipper before 2024-03 has.
+plus that after it; behind several commands at one rest, by that before the first plus that after
+the last (Klipper before 2024: the longest before any of them). So does a SET_PRESSURE_ADVANCE that
+changes the time over which the extruder's speed is averaged, which is 0 without pressure advance.
+Klipper before 2025-09-03, and Kalico, flush for every SET_PRESSURE_ADVANCE: their machines name it
+among their ``stopping_macros``, or have a ``max_accel_to_decel_mm_s2``, which only a Klipper before
+2024-03 has.
 
 Sources: klippy/toolhead.py (flush_step_generation, _calc_print_time), klippy/extras/
 motion_queuing.py, klippy/extras/input_shaper.py, klippy/kinematics/extruder.py
@@ -28,8 +30,6 @@ from stillpath.models.shaper_pulses import SHAPERS, shaper_pulses
 __all__ = ["pressure_advance", "shaper"]
 
 _LEAST_S = 1e-3
-_SMOOTH_S = 0.04
-"""Klipper's default of pressure_advance_smooth_time."""
 _MOST_SMOOTH_S = 0.2
 _MOST_REACH_S = 1.0
 _KINDS = tuple(SHAPERS)
@@ -51,7 +51,7 @@ def pressure_advance(state: MachineState, command: Command) -> int:
         found = _EXTRUDER.fullmatch(given["EXTRUDER"])
         if found is None:
             # An [extruder_stepper]'s may change or not.
-            return state.event(EventKind.STOP, 2.0 * before_s)
+            return _flush(state, EventKind.STOP, before_s)
         extruder = int(found[1] or 0)
     smooth_s = _extruder_smooth_s(state, extruder)
     again = f"ADVANCE {extruder}" in state.factors
@@ -62,7 +62,7 @@ def pressure_advance(state: MachineState, command: Command) -> int:
         if again and state.i[at.I_KNOWN] & 3 == 3:
             state.warn(_MAY_STOP)
         return state.event(EventKind.HARMLESS)
-    return state.event(EventKind.STOP, before_s + _ahead_s(state))
+    return _flush(state, EventKind.STOP, before_s)
 
 
 def shaper(state: MachineState, command: Command) -> int:
@@ -79,15 +79,31 @@ def shaper(state: MachineState, command: Command) -> int:
         state.factors[f"shaper {axis}"] = float(_KINDS.index(_modelled(kind)))
         state.factors[f"f_hz {axis}"] = f_hz
         state.factors[f"damping {axis}"] = damping
-    return state.event(EventKind.SHAPER, before_s + _ahead_s(state))
+    return _flush(state, EventKind.SHAPER, before_s)
+
+
+def _flush(state: MachineState, kind: EventKind, before_s: float) -> int:
+    """Write an event that stands for the look-ahead, less what was counted at this rest."""
+    known = state.factors
+    # A macro may have moved.
+    place, counted_s = state.moves + int(state.i[at.I_MACROS]), 0.0
+    if known.get("flushed at") == place:
+        first_s, counted_s = known["flushed before"], known["flushed for"]
+        before_s = max(before_s, first_s) if _is_older(state) else first_s
+    stands_s = max(before_s + _ahead_s(state), counted_s)
+    known |= {"flushed at": place, "flushed before": before_s, "flushed for": stands_s}
+    return state.event(kind, stands_s - counted_s)
 
 
 def _always_stops(state: MachineState, command: Command) -> bool:
     """Return whether the machine's Klipper flushes even if nothing changes."""
+    return _is_older(state) or command.name in map(str.upper, state.firmware.stopping_macros)
+
+
+def _is_older(state: MachineState) -> bool:
+    """Return whether the machine's Klipper is from before 2024-03."""
     firmware = state.firmware
-    if isinstance(firmware, Klipper) and firmware.planner.max_accel_to_decel_mm_s2 is not None:
-        return True
-    return command.name in map(str.upper, firmware.stopping_macros)
+    return isinstance(firmware, Klipper) and firmware.planner.max_accel_to_decel_mm_s2 is not None
 
 
 def _ahead_s(state: MachineState) -> float:
@@ -102,8 +118,10 @@ def _ahead_s(state: MachineState) -> float:
 def _extruder_smooth_s(state: MachineState, extruder: int) -> float:
     """Return the time over which an extruder's speed is averaged; 0: it is not."""
     advance_s = state.factors.get(f"ADVANCE {extruder}", state.machine.pressure_advance_s)
-    smooth_s = state.factors.get(f"SMOOTH_TIME {extruder}", _SMOOTH_S) if advance_s > 0.0 else 0.0
-    return min(smooth_s, _MOST_SMOOTH_S)
+    if not (advance_s > 0.0 and isinstance(state.firmware, Klipper)):
+        return 0.0
+    stated_s = state.firmware.extruder.pressure_advance_smooth_time_s
+    return min(state.factors.get(f"SMOOTH_TIME {extruder}", stated_s), _MOST_SMOOTH_S)
 
 
 def _shaper(state: MachineState, axis: str) -> tuple[str, float, float]:

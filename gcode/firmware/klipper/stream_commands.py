@@ -47,6 +47,10 @@ class KlipperStreamCommands:
 
     def __init__(self, firmware: Klipper) -> None:
         self._shaper = firmware.shaper
+        self.shaper_absent = firmware.no_input_shaper
+        self._corner_words = [b"SQUARE_CORNER_VELOCITY"]
+        if "M205" in firmware.limit_macros:
+            self._corner_words.append(b"M205")
         off = f"SET_INPUT_SHAPER SHAPER_FREQ_X=0 SHAPER_FREQ_Y=0{self._smoothers(on=False)}\n"
         self.shaper_off = self.file_shaper_off = off.encode()
 
@@ -118,4 +122,5 @@ class KlipperStreamCommands:
 
     def unmarks(self, line: bytes) -> bool:
         """Return whether a line sets the corner velocity, which holds the mark."""
-        return b"SQUARE_CORNER_VELOCITY" in line.split(b";", 1)[0].upper()
+        code = line.split(b";", 1)[0].upper()
+        return any(word in code for word in self._corner_words)

@@ -53,6 +53,7 @@ class MarlinStreamCommands:
     factors_need_axes = False
     advance_off = b""
     advance_assumed = False
+    shaper_absent = False
     file_shaper_off = b"M593 F0\n"
 
     def __init__(self, firmware: Marlin) -> None:

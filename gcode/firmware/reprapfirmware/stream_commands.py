@@ -51,6 +51,7 @@ class RepRapStreamCommands:
     ignores_subcodes = False
     marks = False
     factors_need_axes = True
+    shaper_absent = False
 
     def __init__(self, firmware: RepRapFirmware, pressure_advance_s: float) -> None:
         shaper = firmware.shaper
