@@ -7,7 +7,7 @@ from typing import Any
 
 from playwright.sync_api import expect
 
-from tests.web.served import Service
+from tests.web.served import PART, Service
 from tests.web.visitor import Visitor
 
 PHONE = {"viewport": {"width": 390, "height": 800}}
@@ -79,6 +79,15 @@ def test_a_list_that_follows_its_jobs_leaves_finger_and_focus_where_they_are(
     expect(bar).to_have_attribute("value", "0.06")
     page.mouse.up()
     expect(page.get_by_role("dialog")).to_contain_text("Delete this job?")
+
+
+def test_a_phone_whose_updates_ended_follows_a_job(visitor: Visitor, service: Service):
+    """Safari before 17.4, Firefox before 124 and Chrome before 116 have no `AbortSignal.any`."""
+    job = service.submit(PART, "old-phone.gcode")
+    page = visitor.open(f"#/jobs/{job}", script="delete AbortSignal.any;", **PHONE)
+    expect(page.locator(".headline")).to_be_visible()
+    expect(page.locator(".stage:not([aria-busy])")).to_be_visible()
+    expect(page.get_by_role("alert")).to_have_count(0)
 
 
 def test_why_a_job_was_not_deleted_stays_to_be_read(visitor: Visitor, gear: dict[str, Any]):
