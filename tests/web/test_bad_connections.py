@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+from pathlib import Path
 from typing import Any
 
 from playwright.sync_api import expect
@@ -79,6 +81,33 @@ def test_a_list_that_follows_its_jobs_leaves_finger_and_focus_where_they_are(
     expect(bar).to_have_attribute("value", "0.06")
     page.mouse.up()
     expect(page.get_by_role("dialog")).to_contain_text("Delete this job?")
+
+
+def test_a_screen_reader_hears_quarters_of_a_slow_upload(visitor: Visitor, tmp_path: Path):
+    """What lives in a live region is spoken whenever it changes."""
+    heard = """
+    window.heard = [];
+    new MutationObserver((changes) => {
+      for (const { target } of changes) {
+        const at = target instanceof Element ? target : target.parentElement;
+        const near = at?.closest("[aria-live]");
+        if (near && near.ariaLive !== "off" && target.textContent) heard.push(target.textContent);
+      }
+    }).observe(document, { childList: true, characterData: true, subtree: true });
+    """
+    file = tmp_path / "slow.gcode"
+    file.write_bytes(PART)
+    page = visitor.open("#/", script=heard, **PHONE)
+    page.get_by_label(re.compile("Choose a G-code")).set_input_files(file)
+    page.get_by_role("combobox", name="Machine").fill("ender3")
+    page.keyboard.press("Enter")
+    network = page.context.new_cdp_session(page)
+    slow = {"offline": False, "latency": 0, "downloadThroughput": -1}
+    network.send("Network.emulateNetworkConditions", slow | {"uploadThroughput": len(PART) // 6})
+    page.get_by_role("button", name="Compensate").click()
+    page.wait_for_url("**/#/jobs/*")
+    sending = [text for text in page.evaluate("heard") if text.startswith("Sending: ")]
+    assert 1 <= len(sending) <= 5, sending
 
 
 def test_a_phone_whose_updates_ended_follows_a_job(visitor: Visitor, service: Service):
