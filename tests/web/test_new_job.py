@@ -259,6 +259,23 @@ def test_a_view_that_did_not_come_is_fetched_again(visitor: Visitor):
     expect(page.locator("h1")).to_have_text("Machines")
 
 
+def test_a_page_from_before_an_update_is_loaded_anew(visitor: Visitor, service: Service):
+    """A tab stayed open: its modules are of the old version, and what it fetches is new."""
+    page = visitor.open("#/jobs")
+    index = service.api.get("/").text
+    newer = re.sub(r"assets/\w+/", "assets/0123456789ab/", index)
+    asks_for_more = 'import { notYet } from "../lib/dom.js"; export const show = notYet;'
+    page.route(f"{visitor.url}/", lambda route: route.fulfill(body=newer), times=1)
+    page.route(
+        "**/views/machines.js",
+        lambda route: route.fulfill(content_type="text/javascript", body=asks_for_more),
+        times=1,
+    )
+    page.get_by_role("link", name="Machines").click()
+    expect(page.locator("h1")).to_have_text("Machines")
+    expect(page.get_by_role("alert")).to_have_count(0)
+
+
 def test_a_request_that_is_refused_says_why(visitor: Visitor, tmp_path: Path):
     file = tmp_path / "part.gcode"
     file.write_bytes(PART)

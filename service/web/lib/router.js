@@ -44,8 +44,10 @@ export function startRouter(main, routes) {
         setTitle("No such page");
       } else {
         const params = (route.pattern.exec(path) ?? []).slice(1).map(decodeURIComponent);
-        const view = await route.load().catch(() => {
-          throw unreachable();
+        const view = await route.load().catch(async () => {
+          if (!await isOutdated()) throw unreachable();
+          location.reload();
+          return new Promise(() => {}); // the page ends here
         });
         if (here.signal.aborted) return;
         await view.show({ main, signal: here.signal, setTitle, params });
@@ -64,6 +66,22 @@ export function startRouter(main, routes) {
     if (location.hash === "" || location.hash.startsWith("#/")) show();
   });
   show();
+}
+
+/**
+ * Return whether the service was updated since this page came: what is fetched now may ask modules
+ * that came then for what they do not have.
+ *
+ * @returns {Promise<boolean>}
+ */
+async function isOutdated() {
+  try {
+    const page = await (await fetch(location.pathname)).text();
+    const version = /\bassets\/\w+\//.exec(page);
+    return version !== null && !import.meta.url.includes(version[0]);
+  } catch {
+    return false;
+  }
 }
 
 /** @param {string} name */
