@@ -68,6 +68,7 @@ _WRITE_QUEUE: deque[_PendingWrite] = deque()
 _MIGRATION_LOCK = 0x57111_0000
 _READ_ONLY = "25006"
 """PostgreSQL's code of a server that takes no writes: a standby, or one whose disk is full."""
+_IOERR = (sqlite3.SQLITE_IOERR_WRITE, sqlite3.SQLITE_IOERR_FSYNC, sqlite3.SQLITE_IOERR_SHMSIZE)
 _ON_POSTGRESQL: dict[str, Any] = {
     # A pooler such as PgBouncer may run the next statement on another connection to the server.
     "prepare_threshold": None,
@@ -415,7 +416,7 @@ def _translate_errors(engine: Engine) -> Iterator[None]:
             raise  # a bug of ours
         code, file = getattr(original, "sqlite_errorcode", 0), Path(engine.url.database or "")
         # An exceeded quota is to SQLite an error like any other.
-        beyond = code & 0xFF == sqlite3.SQLITE_IOERR and refuses_more(file.parent)
+        beyond = code in _IOERR and refuses_more(file.parent)
         if code == sqlite3.SQLITE_FULL or beyond:
             raise DatabaseFull(
                 f"the disk of the database {_shown(engine)}, or a quota on it, is full; make room"

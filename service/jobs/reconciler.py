@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import structlog
 
-from stillpath.service.database.engine import DatabaseAway
+from stillpath.service.database.engine import DatabaseAway, DatabaseFull
 from stillpath.service.jobs.cluster import Cluster, ClusterAway
 from stillpath.service.jobs.state import START_WITHIN_S, Job, JobState, Lost
 from stillpath.service.jobs.store import JobStore
@@ -139,7 +139,8 @@ class Reconciler:
                 self._tick()
             except (DatabaseAway, ClusterAway) as error:
                 self._set_trouble(str(error))
-                if isinstance(error, DatabaseAway) and self._disk.is_full:
+                is_full = isinstance(error, DatabaseAway) and self._disk.is_full
+                if is_full or isinstance(error, DatabaseFull):
                     self._disk.give_up()  # jobs wait; the reserve lets their states be written
                 self.slots = 0
                 if isinstance(error, ClusterAway):
