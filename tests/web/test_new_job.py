@@ -259,6 +259,24 @@ def test_a_view_that_did_not_come_is_fetched_again(visitor: Visitor):
     expect(page.locator("h1")).to_have_text("Machines")
 
 
+def test_a_view_that_some_browsers_never_fetch_again_comes_with_the_page(visitor: Visitor):
+    """Firefox before 155 keeps in mind that a module did not come (whatwg/html#6768)."""
+    visitor.expected = {503}
+    page = visitor.open("#/")
+    page.route("**/views/machines.js", lambda route: route.fulfill(status=503), times=2)
+    page.get_by_role("link", name="Machines").click()
+    page.get_by_role("button", name="Try again").click()
+    expect(page.locator("h1")).to_have_text("Machines")
+
+
+def test_a_page_without_its_script_says_so(visitor: Visitor):
+    visitor.expected = {"ERR_FAILED"}
+    page = visitor.open("#/")
+    page.route("**/app.js", lambda route: route.abort())
+    page.reload()
+    expect(page.get_by_role("main")).to_contain_text("reload the page")
+
+
 def test_a_page_from_before_an_update_is_loaded_anew(visitor: Visitor, service: Service):
     """A tab stayed open: its modules are of the old version, and what it fetches is new."""
     page = visitor.open("#/jobs")

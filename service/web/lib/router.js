@@ -26,6 +26,8 @@ import { retryPanel, unreachable } from "./problem.js";
 export function startRouter(main, routes) {
   let leave = new AbortController();
   let first = true;
+  /** Routes whose modules did not come. */
+  const failed = new Set();
   const show = async () => {
     leave.abort();
     const here = new AbortController();
@@ -45,7 +47,9 @@ export function startRouter(main, routes) {
       } else {
         const params = (route.pattern.exec(path) ?? []).slice(1).map(decodeURIComponent);
         const view = await route.load().catch(async () => {
-          if (!await isOutdated()) throw unreachable();
+          const again = failed.has(route);
+          failed.add(route);
+          if (!await helpsReloading(again)) throw unreachable();
           location.reload();
           return new Promise(() => {}); // the page ends here
         });
@@ -69,16 +73,18 @@ export function startRouter(main, routes) {
 }
 
 /**
- * Return whether the service was updated since this page came: what is fetched now may ask modules
- * that came then for what they do not have.
+ * Return whether the page is to be loaded anew, for a module did not come although the service answers:
+ * after an update, modules of two versions do not fit together; and many browsers (Firefox before 155)
+ * never fetch again what failed once, so that trying again would not help.
  *
+ * @param {boolean} again It is not the first time.
  * @returns {Promise<boolean>}
  */
-async function isOutdated() {
+async function helpsReloading(again) {
   try {
     const page = await (await fetch(location.pathname)).text();
     const version = /\bassets\/\w+\//.exec(page);
-    return version !== null && !import.meta.url.includes(version[0]);
+    return version !== null && (again || !import.meta.url.includes(version[0]));
   } catch {
     return false;
   }
