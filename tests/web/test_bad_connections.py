@@ -119,6 +119,20 @@ def test_a_phone_whose_updates_ended_follows_a_job(visitor: Visitor, service: Se
     expect(page.get_by_role("alert")).to_have_count(0)
 
 
+def test_the_focus_stays_on_the_pager_at_the_last_page(visitor: Visitor, gear: dict[str, Any]):
+    def answer(route: Any) -> None:
+        following = None if "cursor" in route.request.url else "c"
+        route.fulfill(body=json.dumps({"jobs": [gear], "next": following}))
+
+    page = visitor.open("#/", **PHONE)
+    page.route("**/v1/jobs?**", answer)
+    page.evaluate("location.hash = '#/jobs'")
+    page.get_by_role("button", name="Older").press("Enter")
+    expect(page.get_by_role("button", name="Newer")).to_be_focused()
+    page.keyboard.press("Enter")
+    expect(page.get_by_role("button", name="Older")).to_be_focused()
+
+
 def test_why_a_job_was_not_deleted_stays_to_be_read(visitor: Visitor, gear: dict[str, Any]):
     visitor.expected = {503}
     page = visitor.open("#/jobs", **PHONE)

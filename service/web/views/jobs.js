@@ -94,8 +94,10 @@ export async function show({ main, signal, setTitle }) {
         ? h("ul.plain", null, [...rows.values()].map(({ element }) => element))
         : h("p.empty", null, state ? "No jobs are in this state." : "No jobs yet."));
     }
+    const turned = [newer, older].find((button) => button === document.activeElement);
     newer.disabled = cursors.length < 2;
     older.disabled = !page.next;
+    if (turned?.disabled) (turned === older ? newer : older).focus(); // a disabled one loses it
     pager.hidden = cursors.length < 2 && !page.next;
     if (focused && document.activeElement === document.body) /** @type {HTMLElement | null} */ (list.querySelector(`[data-focus="${CSS.escape(focused)}"]`))?.focus();
   }
