@@ -2,17 +2,18 @@
 
 `Watcher` is a reader whose requests are not rate-limited, for following a job; `Uploader` is a
 submitter who holds an upload slot until the response; `Operator` is an admin, or anyone on this
-computer if no keys are required.
+computer if no keys are required; `Fetcher` is a reader, or a signed link in place of his key.
 """
 
 from __future__ import annotations
 
+import hmac
 import time
 from collections.abc import AsyncIterator
 from contextlib import suppress
 from typing import Annotated, NoReturn
 
-from fastapi import Depends, Request
+from fastapi import Depends, Query, Request
 from fastapi.security import APIKeyHeader, HTTPAuthorizationCredentials, HTTPBearer
 
 from stillpath.service.api.body_timeout import body_timeout_of
@@ -21,10 +22,22 @@ from stillpath.service.api.problems import NO_KEY, Problem
 from stillpath.service.database.engine import DatabaseAway
 from stillpath.service.security.audit import AuditLog
 from stillpath.service.security.callers import LOCAL, Caller, Scope
-from stillpath.service.security.keys import KeyStore
+from stillpath.service.security.keys import Key, KeyStore
 from stillpath.service.settings import is_loopback
 
-__all__ = ["Admin", "Operator", "Reader", "Submitter", "Uploader", "Watcher"]
+__all__ = [
+    "Admin",
+    "Fetcher",
+    "Operator",
+    "Reader",
+    "Submitter",
+    "Uploader",
+    "Watcher",
+    "link_query",
+]
+
+_LINK_S = 3600.0
+"""How long a link may be used: a slow download that breaks off begins again with it."""
 
 _ABOUT = (
     "A key of this service (`sp_...`). Not needed if the service only answers its own computer."
@@ -95,9 +108,56 @@ async def _uploader(request: Request, caller: Submitter) -> AsyncIterator[Caller
 Uploader = Annotated[Caller, Depends(_uploader)]
 
 
+def link_query(request: Request, caller: Caller, job_id: str) -> dict[str, str]:
+    """Return what in an address stands for the caller's key, for a job's result and nothing else.
+
+    Browsers send no key with what they download themselves, and a page has no room for a large
+    file. Empty where no key is needed.
+    """
+    until = f"{time.time() + _LINK_S:.0f}"
+    keys: KeyStore = request.app.state.keys
+    signed = keys.sign(caller.key_id or "", _linked(job_id, until))
+    if signed is None:
+        return {}
+    key, signature = signed
+    return {"key": key.id, "until": until, "signature": signature}
+
+
+def _fetcher(
+    request: Request,
+    job_id: str,
+    shown: _Shown,
+    key: Annotated[str, Query(max_length=64, description="Of a signed link.")] = "",
+    until: Annotated[str, Query(pattern=r"^[0-9]{1,12}$", description="Of a signed link.")] = "0",
+    signature: Annotated[str, Query(max_length=64, description="Of a signed link.")] = "",
+) -> Caller:
+    if not signature:
+        return _allowed(request, shown, Scope.READ)
+    keys: KeyStore = request.app.state.keys
+    signed = keys.sign(key, _linked(job_id, until))
+    right = signed is not None and hmac.compare_digest(signed[1].encode(), signature.encode())
+    if signed is None or not right or int(until) < time.time():
+        _turn_away(
+            request,
+            Caller("-", frozenset(), remote=_remote(request)),
+            "The link has expired or was changed; get another one from the page of the job.",
+        )
+    return _with_scope(request, _holder(request, signed[0]), Scope.READ)
+
+
+Fetcher = Annotated[Caller, Depends(_fetcher)]
+
+
+def _linked(job_id: str, until: str) -> str:
+    return f"result of {job_id} until {until}"
+
+
 def _allowed(request: Request, shown: str | None, scope: Scope, *, counted: bool = True) -> Caller:
     """Return the caller, or raise `Problem`: 401 for a wrong key, 403 for a missing scope."""
-    caller = _caller(request, shown)
+    return _with_scope(request, _caller(request, shown), scope, counted=counted)
+
+
+def _with_scope(request: Request, caller: Caller, scope: Scope, *, counted: bool = True) -> Caller:
     if counted:
         limits: CallerLimits = request.app.state.limits
         limits.take(name_of(caller))
@@ -131,11 +191,18 @@ def _caller(request: Request, shown: str | None) -> Caller:
             Caller("-", frozenset(), remote=remote),
             "This service does not know the key that came with the request.",
         )
+    return _holder(request, key)
+
+
+def _holder(request: Request, key: Key) -> Caller:
+    """Return who has a key, unless it is no longer valid."""
+    remote = _remote(request)
     refusal = key.refusal(time.time())
     if refusal is not None:
         # Counted by address, which a revoked key must not circumvent.
         who = Caller(key.owner, frozenset(), remote=remote)
         _turn_away(request, who, f"{refusal} Ask for a new one.")
+    keys: KeyStore = request.app.state.keys
     with suppress(DatabaseAway):  # failing to record the use must not refuse the request
         keys.used(key)
     return key.caller(remote)

@@ -17,7 +17,7 @@ from stillpath.service.api.intake import Intake
 from stillpath.service.api.job_lookup import JobId, find, no_such_job
 from stillpath.service.api.problems import Problem, responses
 from stillpath.service.api.schemas import DeliveryView, JobPage, JobQuery, JobView
-from stillpath.service.database.engine import DatabaseAway
+from stillpath.service.database.engine import DatabaseAway, DatabaseFull
 from stillpath.service.deliveries.sender import Sender
 from stillpath.service.jobs.state import Cancelled, Job, JobKind, JobState
 from stillpath.service.jobs.store import BadCursor, JobStore
@@ -208,8 +208,8 @@ async def _written(request: Request, write: Callable[[], _T]) -> _T:
     disk: Disk = request.app.state.disk
     try:
         return await run_in_threadpool(write)
-    except DatabaseAway:
-        if not disk.is_full:
+    except DatabaseAway as error:
+        if not (disk.is_full or isinstance(error, DatabaseFull)):
             raise
         await run_in_threadpool(disk.give_up)
         return await run_in_threadpool(write)

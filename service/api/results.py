@@ -7,13 +7,14 @@ import threading
 from collections import OrderedDict
 from pathlib import PurePath
 from typing import Annotated, Any
+from urllib.parse import urlencode
 
 from fastapi import APIRouter, Path, Request
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
 from stillpath.gcode.containers.sniff import Kind, kind_of
-from stillpath.service.api.access import Reader
+from stillpath.service.api.access import Fetcher, Reader, link_query
 from stillpath.service.api.file_responses import (
     HEADERS,
     MEDIA,
@@ -24,7 +25,7 @@ from stillpath.service.api.file_responses import (
 )
 from stillpath.service.api.job_lookup import JobId, find_done
 from stillpath.service.api.problems import Problem, responses
-from stillpath.service.api.schemas import LayerIndex
+from stillpath.service.api.schemas import LayerIndex, ResultLink
 from stillpath.service.jobs.state import JobKind
 from stillpath.service.security.callers import Caller
 from stillpath.service.storage.base import Storage
@@ -95,7 +96,7 @@ def _file(kinds: tuple[str, ...], description: str, *more: int) -> dict[int | st
     summary="Fetch the compensated G-code",
 )
 @router.head("/result", include_in_schema=False)
-async def read_result(request: Request, job_id: JobId, caller: Reader) -> Response:
+async def read_result(request: Request, job_id: JobId, caller: Fetcher) -> Response:
     """Stream the written file, in the format of the submitted one; `Range` is supported.
 
     For jobs of other kinds, this is their result.
@@ -107,6 +108,26 @@ async def read_result(request: Request, job_id: JobId, caller: Reader) -> Respon
     else:
         media_type = MEDIA[PurePath(job.result_name).suffix]
     return await stored_result(request, job, media_type)
+
+
+@router.post(
+    "/result/link",
+    responses=responses(404, 409),
+    summary="Make a link that fetches the compensated G-code without a key",
+)
+async def link_result(
+    request: Request, response: Response, job_id: JobId, caller: Reader
+) -> ResultLink:
+    """Return a link for what sends no headers, such as a browser's own downloads.
+
+    Whoever has it can fetch the result, for an hour and while the key is valid, and nothing else.
+    """
+    job = await find_done(request, job_id, caller, of_any_kind=True)
+    # Here a page can say what is wrong with the file; of a download nobody reads the answer.
+    await run_in_threadpool(request.app.state.verified.check, job)
+    query = await run_in_threadpool(link_query, request, caller, job_id)
+    response.headers["Cache-Control"] = "no-store"
+    return ResultLink(href=f"/v1/jobs/{job_id}/result" + (f"?{urlencode(query)}" if query else ""))
 
 
 @router.get(

@@ -15,7 +15,16 @@ from stillpath.service.jobs.state import Job, JobKind, JobState
 if TYPE_CHECKING:
     from stillpath.service.deliveries.rows import Delivery
 
-__all__ = ["DeliveryView", "Health", "JobPage", "JobQuery", "JobView", "LayerIndex", "Links"]
+__all__ = [
+    "DeliveryView",
+    "Health",
+    "JobPage",
+    "JobQuery",
+    "JobView",
+    "LayerIndex",
+    "Links",
+    "ResultLink",
+]
 
 _FIELDS = {field.name for field in fields(Job)}
 _EXAMPLE: dict[str, Any] = {
@@ -137,6 +146,15 @@ class Links(BaseModel):
     report_json: str | None = None
     layers: str | None = None
     trajectories: str | None = None
+
+
+class ResultLink(BaseModel):
+    """Where a result can be fetched without a key."""
+
+    href: str = Field(
+        description="Address of the result, valid for an hour and as long as the key.",
+        examples=["/v1/jobs/5f2c8e0e6c0d4a3f9d1b7a52c4e86f10/result?key=3f6a2c&until=1764547200"],
+    )
 
 
 class DeliveryView(BaseModel):

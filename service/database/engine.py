@@ -32,6 +32,7 @@ from stillpath.service.database.migrations import LATEST
 from stillpath.service.instance_lock import is_half_restored
 from stillpath.service.permissions import private_file, private_folder
 from stillpath.service.storage.base import StorageError
+from stillpath.service.storage.disk import refuses_more
 
 if TYPE_CHECKING:
     from sqlalchemy import Table
@@ -67,6 +68,7 @@ _WRITE_QUEUE: deque[_PendingWrite] = deque()
 _MIGRATION_LOCK = 0x57111_0000
 _READ_ONLY = "25006"
 """PostgreSQL's code of a server that takes no writes: a standby, or one whose disk is full."""
+_IOERR = (sqlite3.SQLITE_IOERR_WRITE, sqlite3.SQLITE_IOERR_FSYNC, sqlite3.SQLITE_IOERR_SHMSIZE)
 _ON_POSTGRESQL: dict[str, Any] = {
     # A pooler such as PgBouncer may run the next statement on another connection to the server.
     "prepare_threshold": None,
@@ -412,9 +414,12 @@ def _translate_errors(engine: Engine) -> Iterator[None]:
         original = getattr(error, "orig", None)
         if isinstance(error, InternalError) and getattr(original, "sqlstate", None) != _READ_ONLY:
             raise  # a bug of ours
-        if getattr(original, "sqlite_errorcode", None) == sqlite3.SQLITE_FULL:
+        code, file = getattr(original, "sqlite_errorcode", 0), Path(engine.url.database or "")
+        # An exceeded quota is to SQLite an error like any other.
+        beyond = code in _IOERR and refuses_more(file.parent)
+        if code == sqlite3.SQLITE_FULL or beyond:
             raise DatabaseFull(
-                f"the disk of the database {_shown(engine)} is full; make room on it"
+                f"the disk of the database {_shown(engine)}, or a quota on it, is full; make room"
             ) from error
         raise DatabaseAway(
             f"the database {_shown(engine)} does not answer: {_reason(error)}; see whether it runs "

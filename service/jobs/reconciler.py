@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import structlog
 
-from stillpath.service.database.engine import DatabaseAway
+from stillpath.service.database.engine import DatabaseAway, DatabaseFull
 from stillpath.service.jobs.cluster import Cluster, ClusterAway
 from stillpath.service.jobs.room import RoomForJobs
 from stillpath.service.jobs.state import START_WITHIN_S, Job, JobState, Lost
@@ -70,7 +70,9 @@ class Reconciler:
         self._in_flight: dict[str, tuple[Job, Future]] = {}
         self._broken_since: dict[str, float] = {}
         self._has_lease = False
-        self._leased_at = 0.0
+        self._leased_at = self._awake_at = 0.0
+        # By the clock: when we began to be the service that runs.
+        self._began_at = time.time()
         # Free slots after the last check; None during one.
         self._free: int | None = None
         self._took_over = False
@@ -127,7 +129,8 @@ class Reconciler:
                 self._tick()
             except (DatabaseAway, ClusterAway) as error:
                 self._set_trouble(str(error))
-                if isinstance(error, DatabaseAway) and self._disk.is_full:
+                is_full = isinstance(error, DatabaseAway) and self._disk.is_full
+                if is_full or isinstance(error, DatabaseFull):
                     self._disk.give_up()  # jobs wait; the reserve lets their states be written
                 self.slots = 0
                 if isinstance(error, ClusterAway):
@@ -177,14 +180,22 @@ class Reconciler:
         now = time.monotonic()
         if not self._has_lease or now - self._leased_at > _RENEW_S:
             self._hold_back_starts()
+            had_lease = self._has_lease
             self._has_lease = self._store.lease(_LEASE, self._holder, _LEASE_S, time.time())
-            self._leased_at = now
+            self._leased_at, self._awake_at = now, _since_boot_s()
+            if not had_lease:
+                self._began_at = time.time()
 
     def _hold_back_starts(self) -> None:
-        """After a long time without a service, start no print that nobody expects any more."""
+        """After a long time without a service, start no print that nobody expects any more.
+
+        A clock that is put right while we run (a board without a battery, once it has a network)
+        says so of the time before we began: what was submitted since is expected.
+        """
         latest = time.time() - START_WITHIN_S
         if self._store.leased_until(_LEASE) < latest:
-            jobs = self._store.hold_back_starts(latest)
+            ran = self._has_lease and _since_boot_s() - self._awake_at < START_WITHIN_S
+            jobs = self._store.hold_back_starts(min(latest, self._began_at) if ran else latest)
             if jobs:
                 self._log.warning("prints will not be started: no service was running", jobs=jobs)
 
@@ -316,6 +327,13 @@ class Reconciler:
                 pause = _TICK_S
             if self._stopping.wait(pause):
                 return
+
+
+def _since_boot_s() -> float:
+    """Return a time that nobody sets and that goes on while the computer sleeps, if it has one."""
+    if hasattr(time, "CLOCK_BOOTTIME"):
+        return time.clock_gettime(time.CLOCK_BOOTTIME)
+    return time.time()
 
 
 def _reason(future: Future) -> str:

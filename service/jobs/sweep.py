@@ -11,7 +11,7 @@ from pathlib import Path
 
 import structlog
 
-from stillpath.service.database.engine import DatabaseAway
+from stillpath.service.database.engine import DatabaseAway, DatabaseFull
 from stillpath.service.jobs.expiry import Expiry
 from stillpath.service.jobs.state import Job, JobState
 from stillpath.service.jobs.store import JobStore
@@ -71,8 +71,10 @@ class Sweep:
         self._sweep_incoming()
         try:
             self._forget_expired()
-        except DatabaseAway:
-            if self._disk.is_full:  # then the next time there is room to delete
+        except DatabaseAway as error:
+            if self._disk.is_full or isinstance(
+                error, DatabaseFull
+            ):  # then the next time there is room to delete
                 self._disk.give_up()
             raise
         self._sweep_orphans()

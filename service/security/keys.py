@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import hmac
 import re
 import secrets
 import sys
@@ -163,6 +164,20 @@ class KeyStore:
         with reading(self._engine) as connection:
             row = connection.execute(query).mappings().first()
         return None if row is None else _key(row)
+
+    def sign(self, key_id: str, text: str) -> tuple[Key, str] | None:
+        """Return a key, and its signature of a text; None: there is no such key.
+
+        The signature (HMAC-SHA256) is made with what the database holds of the key, so that every
+        process of the service knows it, and it ends with the key.
+        """
+        if not key_id.isalnum():
+            return None
+        with reading(self._engine) as connection:
+            row = connection.execute(select(keys).where(keys.c.id == key_id)).mappings().first()
+        if row is None:
+            return None
+        return _key(row), hmac.new(row["sha256"].encode(), text.encode(), "sha256").hexdigest()
 
     def used(self, key: Key) -> None:
         """Note that a key was used, at most once a minute."""

@@ -7,13 +7,14 @@ import errno
 import os
 import shutil
 import stat
+import tempfile
 from pathlib import Path
 
 import structlog
 
 from stillpath.service.permissions import private_folder
 
-__all__ = ["DISK_FULL", "Disk", "NoRoom", "Written", "written_bytes"]
+__all__ = ["DISK_FULL", "Disk", "NoRoom", "Written", "refuses_more", "written_bytes"]
 
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 """Error numbers of a full disk."""
@@ -21,7 +22,6 @@ DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 _MIB = 1 << 20
 _BALLAST = "disk-reserve"
 _BALLAST_BYTES = 8 * _MIB
-_CHUNK = bytes(_MIB)
 
 
 class NoRoom(OSError):
@@ -120,7 +120,7 @@ class Disk:
 
     @property
     def is_full(self) -> bool:
-        """Whether there is hardly space left for the database."""
+        """Whether there is hardly space left for the database; a quota does not show here."""
         return bool(self._reserve_bytes) and self.free_bytes() < _BALLAST_BYTES
 
     def hold(self) -> None:
@@ -130,14 +130,16 @@ class Disk:
         size = min(_BALLAST_BYTES, self._reserve_bytes // 4)
         path = self._folder / _BALLAST
         with contextlib.suppress(OSError):
-            if path.exists() and path.stat().st_size == size:
+            if path.exists() and path.stat().st_size == size and _takes_space(path):
                 return
-            # Actually written: some file systems overcommit.
-            with path.open("wb") as file:
-                for start in range(0, size, len(_CHUNK)):
-                    file.write(_CHUNK[: size - start])
-                file.flush()
-                os.fsync(file.fileno())
+            try:
+                # Actually written: some file systems overcommit, and some compress.
+                with path.open("wb") as file:
+                    file.write(os.urandom(size))
+                    file.flush()
+                    os.fsync(file.fileno())
+            except OSError:  # a quota has no room for it: half of it would only take what is left
+                path.unlink()
 
     def give_up(self) -> None:
         """Release the space reserved by `hold`, for necessary writes on a full disk."""
@@ -168,6 +170,18 @@ class Written:
         return self._most_bytes
 
 
+def refuses_more(folder: Path) -> bool:
+    """Return whether a folder has no room for 1 MiB more: of a quota nothing else tells."""
+    try:
+        with tempfile.TemporaryFile(dir=folder) as file:
+            # Not synced: Btrfs would not give the space back for half a minute.
+            file.write(os.urandom(_MIB))
+            file.flush()
+    except OSError as error:
+        return error.errno in DISK_FULL
+    return False
+
+
 def written_bytes(folder: Path) -> int:
     """Return the size of the files in a folder, and of those without a name on its disk.
 
@@ -182,6 +196,12 @@ def written_bytes(folder: Path) -> int:
         for path in folder.rglob("*"):
             size_bytes += path.stat().st_size
     return size_bytes
+
+
+def _takes_space(file: Path) -> bool:
+    """Return whether a file is not all zeros, as earlier versions wrote it, which compress."""
+    with file.open("rb") as opened:
+        return any(opened.read(64))
 
 
 def _unnamed_bytes(device: int) -> int:

@@ -99,6 +99,15 @@ def test_nothing_is_named_that_lies_elsewhere():
         assert not re.search(r"\binnerHTML\b|\beval\(|new Function|insertAdjacentHTML", text), file
 
 
+def test_browsers_without_a_dark_side_get_the_light_one():
+    """Without colours the curves of a chart cannot be told apart."""
+    style = (WEB / "styles" / "base.css").read_text("utf-8")
+    both, _, fallback = style.partition("@supports not (color: light-dark(")
+    light = re.findall(r"(--[\w-]+): light-dark\((#\w+), #\w+\);", both)
+    assert len(light) == both.count("light-dark(") > 10
+    assert re.findall(r"(--[\w-]+): (#\w+);", fallback.partition("}")[0]) == light
+
+
 def test_vendored_files_are_those_of_the_table():
     table = (WEB / "vendor" / "README.md").read_text("utf-8")
     named = dict(re.findall(r"\| `([\w.]+)` \|.*`([0-9a-f]{64})`", table))

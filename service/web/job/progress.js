@@ -1,10 +1,8 @@
 /** A job's progress: its place in the queue, then stage, share and time left. */
 
-import { announce } from "../lib/announce.js";
+import { announcer } from "../lib/announce.js";
 import { fill, h } from "../lib/dom.js";
 import { capital, counted, remaining } from "../lib/format.js";
-
-const ANNOUNCE_EVERY = 0.25;
 
 /**
  * @returns {{element: HTMLElement, update: (job: any) => void, silence: () => void}}
@@ -15,7 +13,7 @@ export function progressPanel() {
   const left = h("p.hint.left");
   const share = h("p.share", { "aria-hidden": "true" });
   const element = h("section.card.progress", { "aria-label": "Progress" }, h("div.row", null, stage, share), bar, left);
-  let said = -1;
+  const announce = announcer();
   const update = (/** @type {any} */ job) => {
     if (job.state === "queued") {
       bar.removeAttribute("value");
@@ -29,11 +27,7 @@ export function progressPanel() {
     fill(share, `${Math.floor(100 * job.progress)} %`);
     fill(left, remaining(job.eta_s) || "Time left is not known yet",
       job.attempt > 1 ? ` · ${restartReason(job)}` : "");
-    const step = Math.floor(job.progress / ANNOUNCE_EVERY);
-    if (step !== said) {
-      said = step;
-      announce(`${capital(job.stage)}, ${Math.floor(100 * job.progress)} percent. ${remaining(job.eta_s)}`);
-    }
+    announce(job.progress, `${capital(job.stage)}, ${Math.floor(100 * job.progress)} percent. ${remaining(job.eta_s)}`);
   };
   const silence = () => fill(left, "The service does not answer; it is asked again until it does.");
   return { element, update, silence };

@@ -1,6 +1,7 @@
 /** Layers as they come from the service: fetched when they are looked at, neighbours before. */
 
 import { request } from "../lib/api.js";
+import { either } from "../lib/signals.js";
 
 /** What stands for an error that is not known. */
 export const UNKNOWN_ERROR = 65535;
@@ -115,7 +116,7 @@ export class Tiles {
     const coming = this._coming.get(k);
     if (coming) return coming.tile;
     const stop = new AbortController();
-    const signal = AbortSignal.any([stop.signal, this._signal]);
+    const signal = either(stop.signal, this._signal);
     const tile = this._load(k, signal).finally(() => {
       this._coming.delete(k);
     });

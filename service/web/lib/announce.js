@@ -12,3 +12,20 @@ export function announce(text) {
     live.textContent = text;
   });
 }
+
+const QUARTER = 0.25;
+
+/**
+ * Return what says how far something is, a quarter at a time: whatever else changes would wait
+ * behind every percent.
+ *
+ * @returns {(share: number, text: string) => void}
+ */
+export function announcer() {
+  let said = -1;
+  return (share, text) => {
+    const step = Math.floor(share / QUARTER);
+    if (step !== said) announce(text);
+    said = step;
+  };
+}

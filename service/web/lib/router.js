@@ -26,6 +26,8 @@ import { retryPanel, unreachable } from "./problem.js";
 export function startRouter(main, routes) {
   let leave = new AbortController();
   let first = true;
+  /** Routes whose modules did not come. */
+  const failed = new Set();
   const show = async () => {
     leave.abort();
     const here = new AbortController();
@@ -44,8 +46,12 @@ export function startRouter(main, routes) {
         setTitle("No such page");
       } else {
         const params = (route.pattern.exec(path) ?? []).slice(1).map(decodeURIComponent);
-        const view = await route.load().catch(() => {
-          throw unreachable();
+        const view = await route.load().catch(async () => {
+          const again = failed.has(route);
+          failed.add(route);
+          if (!await helpsReloading(again)) throw unreachable();
+          location.reload();
+          return new Promise(() => {}); // the page ends here
         });
         if (here.signal.aborted) return;
         await view.show({ main, signal: here.signal, setTitle, params });
@@ -64,6 +70,24 @@ export function startRouter(main, routes) {
     if (location.hash === "" || location.hash.startsWith("#/")) show();
   });
   show();
+}
+
+/**
+ * Return whether the page is to be loaded anew, for a module did not come although the service answers:
+ * after an update, modules of two versions do not fit together; and many browsers (Firefox before 155)
+ * never fetch again what failed once, so that trying again would not help.
+ *
+ * @param {boolean} again It is not the first time.
+ * @returns {Promise<boolean>}
+ */
+async function helpsReloading(again) {
+  try {
+    const page = await (await fetch(location.pathname)).text();
+    const version = /\bassets\/\w+\//.exec(page);
+    return version !== null && (again || !import.meta.url.includes(version[0]));
+  } catch {
+    return false;
+  }
 }
 
 /** @param {string} name */

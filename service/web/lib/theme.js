@@ -5,10 +5,13 @@ const CHOICES = /** @type {const} */ (["system", "light", "dark"]);
 const NAMES = { system: "as the system", light: "light", dark: "dark" };
 const system = matchMedia("(prefers-color-scheme: dark)");
 const listeners = new Set();
+/** Older browsers have the light side only (styles/base.css). */
+const canBeDark = CSS.supports("color", "light-dark(#000, #fff)");
 
 /** @returns {boolean} */
 export function isDark() {
   const chosen = document.documentElement.dataset.theme;
+  if (!canBeDark) return false;
   return chosen ? chosen === "dark" : system.matches;
 }
 

@@ -7,6 +7,7 @@
 
 import { getJson, request } from "./api.js";
 import { ProblemError } from "./problem.js";
+import { either } from "./signals.js";
 
 const FINAL = new Set(["done", "failed", "cancelled"]);
 const ASK_EVERY_MS = 1000;
@@ -44,7 +45,7 @@ export async function watchJob(id, onJob, signal, onSilence = () => {}) {
   while (!over) {
     const turned = new AbortController(); // the tab is hidden, or looked at again
     const turn = () => turned.abort();
-    const here = AbortSignal.any([signal, turned.signal]);
+    const here = either(signal, turned.signal);
     document.addEventListener("visibilitychange", turn);
     try {
       try {
@@ -81,7 +82,7 @@ async function whileHeard(signal, listen) {
   };
   heard();
   try {
-    await listen(AbortSignal.any([signal, quiet.signal]), heard);
+    await listen(either(signal, quiet.signal), heard);
   } finally {
     clearTimeout(timer);
   }
@@ -123,10 +124,14 @@ async function follow(id, onJob, signal, heard) {
 /** @param {number} ms @param {AbortSignal} signal @returns {Promise<void>} */
 export function pause(ms, signal) {
   return new Promise((resolve, reject) => {
-    const timer = setTimeout(resolve, ms);
-    signal.addEventListener("abort", () => {
+    const stop = () => {
       clearTimeout(timer);
       reject(new DOMException("nobody waits", "AbortError"));
-    }, { once: true });
+    };
+    const timer = setTimeout(() => {
+      signal.removeEventListener("abort", stop);
+      resolve();
+    }, ms);
+    signal.addEventListener("abort", stop, { once: true });
   });
 }

@@ -62,11 +62,13 @@ export function measurementPanel({ machines, base, own = false, signal }) {
     for (const file of asked.files) body.append("file", file, file.name);
     look.disabled = true;
     const said = h("span", null, "Identifying; this takes some ten seconds …");
+    // The same text anew would be spoken anew, every second.
+    const tell = (/** @type {string} */ text) => said.textContent === text || fill(said, text);
     fill(result, h("p.row", null, h("progress", { "aria-label": "Identifying" }), said));
     try {
       const path = address(`/v1/machines/${encodeURIComponent(target)}/measurements`, {
         trial: trial ? "true" : "", author: author.value.trim(), ...options });
-      const found = await (await computed(path, { method: "POST", body, signal }, (job) => fill(said, `Identifying: ${job.stage} …`))).json();
+      const found = await (await computed(path, { method: "POST", body, signal }, (job) => tell(`Identifying: ${job.stage} …`))).json();
       if (!trial) {
         announce(`Revision ${found.revision.number} of ${target} is kept.`);
         const here = `#/machines/${encodeURIComponent(target)}`;

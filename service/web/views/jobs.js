@@ -6,7 +6,7 @@ import { confirmed } from "../lib/dialog.js";
 import { fill, focusHeading, h } from "../lib/dom.js";
 import { bytes, duration, um, umOrRange, when } from "../lib/format.js";
 import { problemPanel, retryPanel } from "../lib/problem.js";
-import { isOver } from "../lib/watch.js";
+import { isOver, pause } from "../lib/watch.js";
 import { stateBadge } from "../parts/state.js";
 
 const STATES = [["", "All"], ["queued", "Waiting"], ["running", "Running"], ["done", "Done"], ["failed", "Failed"], ["cancelled", "Cancelled"]];
@@ -22,8 +22,19 @@ export async function show({ main, signal, setTitle }) {
   /** @type {any} */
   let page = { jobs: [], next: null };
   let lacksKey = false;
+  /** What is shown, by the job's id. @type {Map<string, {text: string, element: HTMLElement}>} */
+  let rows = new Map();
+  let complaint = "";
   const list = h("div.jobs");
-  const pager = h("nav.pager", { "aria-label": "Pages of jobs" });
+  const newer = h("button", { type: "button", onclick: () => {
+    if (cursors.length > 1) cursors.pop();
+    reload(true);
+  } }, "Newer");
+  const older = h("button", { type: "button", onclick: () => {
+    if (cursors.at(-1) !== page.next) cursors.push(page.next); // again, where that page did not come
+    reload(true);
+  } }, "Older");
+  const pager = h("nav.pager", { "aria-label": "Pages of jobs" }, newer, older);
   const fault = h("div");
   const filter = h("div.choices", { role: "group", "aria-label": "Show jobs that are" },
     STATES.map(([value, text]) => h("button", {
@@ -47,32 +58,48 @@ export async function show({ main, signal, setTitle }) {
       if (isPast()) return;
       page = found;
       lacksKey = false;
-      fill(fault);
+      complain("");
       draw();
       if (tells) announce(page.jobs.length ? `${page.jobs.length} jobs on this page` : "No jobs");
     } catch (/** @type {any} */ error) {
       if (isAbort(error) || isPast()) return;
       lacksKey = error.status === 401;
-      fill(fault, lacksKey ? retryPanel(error, () => reload(true)) : problemPanel(error));
+      complain(error.message, lacksKey ? retryPanel(error, () => reload(true)) : problemPanel(error));
     }
   }
 
+  /** A complaint is said once, not whenever the list is fetched again. */
+  function complain(/** @type {string} */ text, /** @type {HTMLElement[]} */ ...panel) {
+    if (text === complaint) return;
+    complaint = text;
+    fill(fault, ...panel);
+  }
+
+  /** Rows that are as they were stay in their place: a finger, the focus or a screen reader may be there. */
   function draw() {
     const focused = /** @type {HTMLElement} */ (document.activeElement)?.dataset?.focus;
-    fill(list, page.jobs.length
-      ? h("ul.plain", null, page.jobs.map(row))
-      : h("p.empty", null, state ? "No jobs are in this state." : "No jobs yet."));
-    fill(pager,
-      h("button", { type: "button", disabled: cursors.length < 2, onclick: () => {
-        if (cursors.length > 1) cursors.pop();
-        reload(true);
-      } }, "Newer"),
-      h("button", { type: "button", disabled: !page.next, onclick: () => {
-        if (cursors.at(-1) !== page.next) cursors.push(page.next); // again, where that page did not come
-        reload(true);
-      } }, "Older"));
+    const before = rows;
+    rows = new Map(page.jobs.map((/** @type {any} */ job) => {
+      const text = JSON.stringify(job);
+      const known = before.get(job.id);
+      return [job.id, known?.text === text ? known : { text, element: row(job) }];
+    }));
+    if (rows.size && [...rows.keys()].join() === [...before.keys()].join()) {
+      for (const [id, { element }] of before) {
+        const now = /** @type {any} */ (rows.get(id)).element;
+        if (now !== element) element.replaceWith(now);
+      }
+    } else {
+      fill(list, rows.size
+        ? h("ul.plain", null, [...rows.values()].map(({ element }) => element))
+        : h("p.empty", null, state ? "No jobs are in this state." : "No jobs yet."));
+    }
+    const turned = [newer, older].find((button) => button === document.activeElement);
+    newer.disabled = cursors.length < 2;
+    older.disabled = !page.next;
+    if (turned?.disabled) (turned === older ? newer : older).focus(); // a disabled one loses it
     pager.hidden = cursors.length < 2 && !page.next;
-    if (focused) /** @type {HTMLElement | null} */ (list.querySelector(`[data-focus="${CSS.escape(focused)}"]`))?.focus();
+    if (focused && document.activeElement === document.body) /** @type {HTMLElement | null} */ (list.querySelector(`[data-focus="${CSS.escape(focused)}"]`))?.focus();
   }
 
   function row(/** @type {any} */ job) {
@@ -98,6 +125,8 @@ export async function show({ main, signal, setTitle }) {
   }
 
   async function change(/** @type {() => Promise<any>} */ act, /** @type {string} */ said) {
+    complain("");
+    fill(fault);
     try {
       await act();
       announce(said);
@@ -109,10 +138,15 @@ export async function show({ main, signal, setTitle }) {
   }
 
   await reload();
-  const timer = setInterval(() => {
-    if (!document.hidden && !lacksKey && (cursors.length === 1 || page.jobs.some((/** @type {any} */ j) => !isOver(j)))) reload(false, false);
-  }, REFRESH_MS);
-  signal.addEventListener("abort", () => clearInterval(timer));
+  refresh().catch(() => {}); // not awaited: it ends when the view is left
+
+  /** One request after the other: where each takes long they would pile up, before what is asked for by hand. */
+  async function refresh() {
+    while (!signal.aborted) {
+      await pause(REFRESH_MS, signal);
+      if (!document.hidden && !lacksKey && (cursors.length === 1 || page.jobs.some((/** @type {any} */ j) => !isOver(j)))) await reload(false, false);
+    }
+  }
 }
 
 /** @param {any} job */

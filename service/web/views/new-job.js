@@ -1,7 +1,7 @@
 /** Submit a file: drop it, name the machine, send it. */
 
 import { getJson, isAbort, upload } from "../lib/api.js";
-import { announce } from "../lib/announce.js";
+import { announce, announcer } from "../lib/announce.js";
 import { confirmed } from "../lib/dialog.js";
 import { namingControls } from "../lib/controls.js";
 import { fill, h, hide } from "../lib/dom.js";
@@ -97,7 +97,8 @@ export async function show({ main, signal, setTitle }) {
     const warn = (/** @type {Event} */ event) => event.preventDefault();
     addEventListener("beforeunload", warn);
     send.disabled = true;
-    fill(status, h("div.sending", null, bar, h("div.row", null, text,
+    const announceShare = announcer();
+    fill(status, h("div.sending", { "aria-live": "off" }, bar, h("div.row", null, text,
       h("button", { type: "button", onclick: () => sending.abort() }, "Cancel"))));
     try {
       const query = way.isLive() ? { machine, method: "live", name, ...options.readFile() }
@@ -105,7 +106,9 @@ export async function show({ main, signal, setTitle }) {
       const job = await upload("/v1/jobs", query, file, (share) => {
         bar.value = share;
         isWhole = share === 1;
-        fill(text, share < 1 ? `Sending: ${Math.floor(100 * share)} % of ${bytes(file?.size)}` : "Received; being stored …");
+        const told = share < 1 ? `Sending: ${Math.floor(100 * share)} % of ${bytes(file?.size)}` : "Received; being stored …";
+        fill(text, told);
+        announceShare(share, told);
       }, sending.signal);
       location.hash = `#/jobs/${job.id}`;
     } catch (error) {

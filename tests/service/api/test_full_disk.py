@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import shutil
 import socket
+import sqlite3
 import sys
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import httpx2
 import pytest
+from sqlalchemy.exc import OperationalError
 
+from stillpath.service.database.engine import DatabaseFull, open_database, writing
+from stillpath.service.settings import Settings
 from stillpath.service.storage.disk import Disk, NoRoom
 from tests.service.small_disk import small_disk
 from tests.service.test_server import PRETEND, server, until
@@ -65,6 +71,42 @@ def test_what_the_reserve_is_for(small_disk: Path) -> None:
     foreign = small_disk / "foreign"
     foreign.unlink()
     assert Disk(small_disk / "new" / "data", RESERVE_MIB * MIB).lets_jobs_go_on
+
+
+def test_a_reserve_takes_space_where_the_file_system_compresses(tmp_path: Path) -> None:
+    held = tmp_path / "disk-reserve"
+    held.write_bytes(bytes(MIB))  # as versions before wrote it
+    Disk(tmp_path, 4 * MIB).hold()
+    assert len(zlib.compress(held.read_bytes(), 1)) > 0.99 * MIB
+    before = held.stat()
+    Disk(tmp_path, 4 * MIB).hold()
+    assert held.stat() == before
+
+
+def test_a_quota_is_full_where_the_disk_has_room(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On Btrfs, for instance, only writing tells of a quota; SQLite has no word for it."""
+
+    def refused(**_: Any) -> None:
+        raise OSError(errno.EDQUOT, "Disk quota exceeded")
+
+    engine = open_database(Settings(data_dir=tmp_path))
+    said = sqlite3.OperationalError("disk I/O error")
+    said.sqlite_errorcode = sqlite3.SQLITE_IOERR_WRITE
+    monkeypatch.setattr("stillpath.service.storage.disk.tempfile.TemporaryFile", refused)
+    with pytest.raises(DatabaseFull, match="or a quota on it, is full"), writing(engine):
+        raise OperationalError("DELETE", {}, said)
+    engine.dispose()
+
+
+def test_half_a_reserve_is_not_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(_: int) -> None:
+        raise OSError(errno.EDQUOT, "Disk quota exceeded")
+
+    monkeypatch.setattr("stillpath.service.storage.disk.os.fsync", refused)
+    Disk(tmp_path, 4 * MIB).hold()
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.slow

@@ -140,6 +140,40 @@ def test_a_print_is_not_started_days_after_it_was_expected(
     assert site.get(job_id).print_after == (min(away_h, submitted_h) < 1.0)
 
 
+@pytest.mark.parametrize("slept", [False, True])
+def test_a_clock_that_is_put_right_keeps_no_print_from_starting(
+    site: Site, monkeypatch: pytest.MonkeyPatch, slept: bool
+):
+    """A board without a battery goes on where it was switched off, until the network tells it."""
+    look = looking(site, Workers())
+    switched_off_at = time.time() - 8 * 3600.0
+
+    @dataclass
+    class Clock:
+        ahead_s: float = 0.0
+        CLOCK_BOOTTIME: int = 7
+
+        def time(self) -> float:
+            return switched_off_at + self.ahead_s
+
+        def monotonic(self) -> float:
+            return time.monotonic()
+
+        def clock_gettime(self, _: int) -> float:
+            return time.monotonic() + (self.ahead_s if slept else 0.0)
+
+    clock = Clock()
+    monkeypatch.setattr(reconciler, "time", clock)
+    yesterdays = site.submit("G1", printer="left", print_after=True, created_at=clock.time() - 9e3)
+    look._tick()
+    todays = site.submit("G1 X", printer="left", print_after=True, created_at=clock.time() + 20.0)
+    clock.ahead_s = 8 * 3600.0
+    look._leased_at -= 3.0
+    look._tick()
+    assert not site.get(yesterdays).print_after
+    assert site.get(todays).print_after != slept
+
+
 def test_a_database_that_takes_no_writes_is_trouble_that_lasts(
     site: Site, monkeypatch: pytest.MonkeyPatch
 ):

@@ -13,6 +13,7 @@ from starlette.testclient import TestClient
 
 from stillpath.service.api import create_app
 from stillpath.service.settings import Settings
+from tests.service.jobs.site import until
 from tests.service.runners import pretend
 
 FIRST = "sp_" + "f" * 32
@@ -61,6 +62,51 @@ def test_a_key_from_its_making_to_its_end(client: TestClient):
     actions = [(row["action"], row["subject"]) for row in audit(client)]
     assert ("key.create", made["id"]) in actions
     assert ("key.revoke", made["id"]) in actions
+
+
+def done(client: TestClient, content: bytes, headers: dict[str, str]) -> str:
+    job = client.post("/v1/jobs?machine=ender3", content=content, headers=headers).json()
+    where: str = job["links"]["self"]
+    until(lambda: client.get(where, headers=headers).json()["state"] == "done")
+    return where
+
+
+def test_a_link_stands_for_a_key_for_one_result(
+    client: TestClient, monkeypatch: pytest.MonkeyPatch
+):
+    made = client.post("/v1/keys", json=WISH, headers=ADMIN).json()
+    mine = {"X-Api-Key": made["key"]}
+    where, other = done(client, b"G1 X1", mine), done(client, b"G1 X2", mine)
+    whole = client.get(f"{where}/result", headers=mine).content
+    answer = client.post(f"{where}/result/link", headers=mine)
+    assert (answer.status_code, answer.headers["cache-control"]) == (200, "no-store")
+    href = answer.json()["href"]
+    assert made["key"] not in href
+    assert client.get(href).content == whole
+    assert client.get(href, headers={"Range": "bytes=2-"}).content == whole[2:]
+    assert client.head(href).status_code == 200
+    query = href.partition("?")[2]
+    assert client.get(f"{where}/result").status_code == 401
+    assert client.get(f"{other}/result?{query}").status_code == 401
+    assert client.get(f"{where}/report.json?{query}").status_code in (401, 422)
+    assert client.delete(f"{where}?{query}").status_code in (401, 422)
+    longer = href.replace("until=", "until=9")
+    assert "expired or was changed" in client.get(longer).json()["detail"]
+    assert client.get(href.replace(made["id"], "first")).status_code == 401
+    assert client.post(f"{where}/result/link").status_code == 401
+    with monkeypatch.context() as later:
+        later.setattr(
+            "stillpath.service.api.access.time", SimpleNamespace(time=lambda: time.time() + 3700)
+        )
+        assert client.get(href).status_code == 401
+    assert client.delete(f"/v1/keys/{made['id']}", headers=ADMIN).status_code == 204
+    assert "revoked" in client.get(href).json()["detail"]
+
+
+def test_where_no_key_is_needed_a_link_has_none(tmp_path: Path):
+    with open_client(tmp_path, keys=False) as local:
+        where = done(local, b"G1 X1", {})
+        assert local.post(f"{where}/result/link").json()["href"] == f"{where}/result"
 
 
 @pytest.mark.parametrize(

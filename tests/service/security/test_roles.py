@@ -29,6 +29,7 @@ RULES = {
     "POST /v1/jobs/{job_id}/cancel": SUBMIT,
     "GET /v1/jobs/{job_id}/events": READ,
     "GET /v1/jobs/{job_id}/result": READ,
+    "POST /v1/jobs/{job_id}/result/link": READ,
     "GET /v1/jobs/{job_id}/report": READ,
     "GET /v1/jobs/{job_id}/report.json": READ,
     "GET /v1/jobs/{job_id}/layers": READ,
