@@ -22,6 +22,7 @@ __all__ = [
     "encoded_piece",
     "group_durations",
     "interleave",
+    "lateness_s",
     "limits_in_force",
     "to_units",
 ]
@@ -223,6 +224,15 @@ def encoded_piece(
         rest_s=rest_s,
         phases=phases,
     )
+
+
+def lateness_s(moves: Interleaved, phases: Phases) -> NDArray[np.float64]:
+    """Return how late each line of a stream ends, counted from its stretch's first, shape (n,)."""
+    ours = moves.row < 0
+    first = ours & np.append(True, ~ours)[:-1]
+    begin = np.maximum.accumulate(np.where(first, np.arange(len(first)), 0))
+    passed_s = np.cumsum(np.where(ours & ~first, phases.lasts_s - moves.planned_s, 0.0))
+    return np.where(ours, passed_s - passed_s[begin], 0.0)
 
 
 def group_durations(phases: Phases, groups: Sequence[Group]) -> NDArray[np.float64]:

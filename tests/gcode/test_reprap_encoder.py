@@ -106,6 +106,24 @@ def test_segments_end_on_whole_steps(kinematics: Literal["cartesian", "corexy"])
     assert np.max(np.abs(80.0 * motors - np.rint(80.0 * motors))) < 0.01
 
 
+def slow(kinematics: Literal["cartesian", "corexy"]) -> Machine:
+    """M201 500, which config.g has from the configurator, and commands of three times that."""
+    drive = firmware().x.model_copy(update={"max_accel_mm_s2": 500.0})
+    machine = machine_of(firmware(x=drive, y=drive), kinematics=kinematics)
+    return machine.model_copy(update={"command": CommandLimits(accel_mm_s2=1500.0)})
+
+
+@pytest.mark.parametrize("kinematics", ["cartesian", "corexy"])
+def test_moves_are_long_enough_to_stop_within_the_ring(
+    kinematics: Literal["cartesian", "corexy"],
+) -> None:
+    """Behind short ones the firmware stays slow: the motion was millimetres late, and reverted."""
+    lines = "G1 X200 Y190 E6 F18000\nG1 X20 Y150 E6\nG1 X190 Y20 E6\nG1 X60 Y200 E6\n"
+    _, made = compensated(HEAD + lines, slow(kinematics))
+    gap = deviation(made, made.encoded.phases)
+    assert np.max(gap) < 0.06
+
+
 def zigzag(lines: int) -> str:
     """Infill: lines of 80 mm, .4 mm apart."""
     ends = [f"G1 X{60 if i % 2 else 140} Y{50 + 0.4 * i:.1f} E2.6 F24000\n" for i in range(lines)]
@@ -351,7 +369,7 @@ def test_crowded_ends_are_kept_apart(lasts: list[float], least_s: float) -> None
     final[[n // 2, n - 1]] = True
     begin_s = np.where(np.arange(n) <= n // 2, 0.0, end_s[n // 2])
     keep = np.zeros(n, np.bool_)
-    keep_apart(end_s, np.ones(n, np.bool_), final, begin_s, least_s, keep)
+    keep_apart(end_s, np.ones(n, np.bool_), final, begin_s, np.full(n, least_s), keep)
     assert np.all(keep[final])
     kept = np.concatenate([[0.0], end_s[keep]])
     short = np.diff(kept) < least_s - 1e-8

@@ -27,6 +27,7 @@ from stillpath.gcode.firmware.encoding import (
     encoded_piece,
     group_durations,
     interleave,
+    lateness_s,
     limits_in_force,
     to_units,
 )
@@ -44,7 +45,6 @@ from stillpath.gcode.firmware.marlin.planner import Planner, planner_facts
 from stillpath.gcode.firmware.marlin.starting import (
     StreamLevels,
     gentle_accel_mm_s2,
-    lateness_s,
 )
 from stillpath.gcode.firmware.planning import join_phases
 from stillpath.gcode.firmware.vertices import Lattice, steps_within, vertices_on_steps

@@ -22,10 +22,12 @@ from stillpath.gcode.firmware._encoding_kernels import MoveLimits
 from stillpath.gcode.firmware.advance import feed_at_ends
 from stillpath.gcode.firmware.encoding import (
     Encoded,
+    Interleaved,
     as_moves,
     encoded_piece,
     group_durations,
     interleave,
+    lateness_s,
     limits_in_force,
 )
 from stillpath.gcode.firmware.reprapfirmware._encoder_kernels import assign_speeds, keep_apart
@@ -55,6 +57,10 @@ pressure advance steps by twice the jerk."""
 _DIAGONAL = 1.5
 """Ratio of a CoreXY motor's speed to the path's, and of the changes of Z's direction."""
 _PASSES = 4
+_RING_SHARE = 0.5
+"""Share of half the ring in which late pieces are to be able to stop."""
+_BEHIND_MM, _TRAVEL_BEHIND_MM = 0.04, 0.12
+"""Lag, with and without filament, from which a piece counts as late."""
 _EXACT_S = 2e-6
 _LEAST_S = 0.025
 """As `prepare_least_s` of today's firmware; with an older one, too, lines must be read in time."""
@@ -172,7 +178,18 @@ class RepRapEncoder:
             If segments come faster than the firmware's queue can take them.
         """
         segments = self._sparse(timeline, _split_slow(timeline, segments))
-        segments = self._sparse(timeline, self._on_steps(timeline, segments))
+        segments = self._on_steps(timeline, segments)
+        encoded, behind_mm = self._timed(piece, timeline, self._sparse(timeline, segments))
+        if behind_mm > 0.0:
+            # Behind short moves the ring knows too little to stop, so they stay slow.
+            longer = self._sparse(timeline, self._with_room(timeline, segments))
+            other, other_mm = self._timed(piece, timeline, longer)
+            if other_mm < behind_mm:
+                return other
+        return encoded
+
+    def _timed(self, piece: Piece, timeline: Timeline, segments: Segments) -> tuple[Encoded, float]:
+        """Choose filament and feedrates; return also the lag beyond its limit [mm], or 0."""
         segments = self._advanced(piece, timeline, segments)
         moves = interleave(piece, timeline, segments, 1)
         rows = moves.row
@@ -203,7 +220,8 @@ class RepRapEncoder:
                 break
             missed += miss if attempt == 0 else 0.5 * miss
         self._check_rate(plan, piece)
-        return encoded_piece(timeline, moves, self._limits, best, plan)
+        encoded = encoded_piece(timeline, moves, self._limits, best, plan)
+        return encoded, _behind_mm(moves, plan)
 
     def _sparse(self, timeline: Timeline, segments: Segments) -> Segments:
         """Drop vertices where segments come faster than the firmware's queue can take them."""
@@ -218,14 +236,20 @@ class RepRapEncoder:
         crowded = np.convolve(late[: len(segments)], np.ones(half))[: len(segments)] > 0.0
         if not np.any(crowded):
             return segments
-        keep = np.ones(len(segments), np.bool_)
-        keep_apart(segments.end_s, crowded, segments.final, begin_s, wanted_s / half, keep)
-        return replace(
-            segments,
-            end_s=segments.end_s[keep],
-            end_mm=segments.end_mm[:, keep],
-            group=segments.group[keep],
-        )
+        return _apart(segments, crowded, begin_s, np.full(len(segments), wanted_s / half))
+
+    def _with_room(self, timeline: Timeline, segments: Segments) -> Segments:
+        """Drop vertices so that a share of half a ring is long enough to stop."""
+        start_s, start_mm = _starts(timeline, segments)
+        lasts_s, way_mm = segments.end_s - start_s, np.abs(segments.end_mm - start_mm)[:2]
+        limits = np.array([self._limits.accel_x_mm_s2, self._limits.accel_y_mm_s2])
+        if self._kinematics == "corexy":
+            # A motor makes at most what both axes make.
+            way_mm = np.broadcast_to(way_mm.sum(axis=0), way_mm.shape)
+        braking_s = np.max((way_mm.T / limits).T, axis=0) / lasts_s
+        least_s = braking_s / (2.0 * _RING_SHARE * self._half_ring)
+        every = np.ones(len(segments), np.bool_)
+        return _apart(segments, every, timeline.start_s[segments.group], least_s)
 
     def _advanced(self, piece: Piece, timeline: Timeline, segments: Segments) -> Segments:
         """Return segments with pressure advance in their filament."""
@@ -294,6 +318,32 @@ class RepRapEncoder:
                 "a longer queue (M595 P, firmware.ring_length) or a larger tolerance would do",
                 line=int(piece.moves.line[0]),
             )
+
+
+def _apart(
+    segments: Segments,
+    crowded: NDArray[np.bool_],
+    begin_s: NDArray[np.float64],
+    least_s: NDArray[np.float64],
+) -> Segments:
+    """Return segments without crowded ends that come too soon after the one before."""
+    keep = np.ones(len(segments), np.bool_)
+    keep_apart(segments.end_s, crowded, segments.final, begin_s, least_s, keep)
+    return replace(
+        segments,
+        end_s=segments.end_s[keep],
+        end_mm=segments.end_mm[:, keep],
+        group=segments.group[keep],
+    )
+
+
+def _behind_mm(moves: Interleaved, phases: Phases) -> float:
+    """Return by how much the largest lag of a stretch exceeds what is borne, or 0."""
+    places_mm = moves.places_mm()
+    speed_mm_s = np.hypot(*np.diff(places_mm[:, :2], axis=0).T) / np.maximum(moves.planned_s, 1e-6)
+    borne_mm = np.where(np.diff(places_mm[:, 3]) > 0.0, _BEHIND_MM, _TRAVEL_BEHIND_MM)
+    over_mm = lateness_s(moves, phases) * speed_mm_s - borne_mm
+    return float(np.max(np.where(moves.row < 0, over_mm, 0.0), initial=0.0))
 
 
 def _starts(
