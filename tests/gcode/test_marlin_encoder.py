@@ -29,8 +29,10 @@ from stillpath.models.firmware import Marlin
 from stillpath.models.firmware.marlin import MarlinPlanner, MarlinShaper, PerAxis
 from stillpath.models.machine import CommandLimits, Machine
 from stillpath.models.store import load_machine
+from stillpath.pipeline.piece_compensator import deviation
 from tests.compensating import compensated
 from tests.gcode.cutting import HEAD, MARLIN_PLANNER
+from tests.gcode.cutting import compensated as compensated_piece
 from tests.gcode.prints import polygon
 from tests.gcode.states import differences, tagged
 
@@ -163,6 +165,31 @@ def test_with_classic_jerk_fast_moves_start_as_slowly_as_the_one_before(
     late_s = np.cumsum(phases.lasts_s - planned_s)
     # Before it was 2.9 and 4.6 ms.
     assert np.abs(late_s[1:-1] - late_s[1]).max() < 1.3e-3 * first_steps
+
+
+@pytest.mark.parametrize("name", ["ender3", "voron-v24-250"])
+def test_a_late_piece_has_what_x_and_y_bear_together(name: str) -> None:
+    """M204 as one axis's limit left each only sqrt(1/2) of it on a diagonal: millimetres late."""
+    lines = "G1 X200 Y190 E6 F18000\nG1 X20 Y150 E6\nG1 X190 Y20 E6\nG1 X60 Y200 E6\n"
+    accel = PerAxis(x=5000.0, y=5000.0, z=200.0, e=5000.0)
+    planner = MARLIN_PLANNER.model_copy(
+        update={"max_accel_mm_s2": accel, "accel_mm_s2": 5000.0, "travel_accel_mm_s2": 5000.0}
+    )
+    firmware = FIRMWARE.model_copy(
+        update={"planner": planner, "steps_per_mm": PerAxis(x=80.0, y=80.0, z=400.0, e=400.0)}
+    )
+    command = CommandLimits(accel_mm_s2=5000.0)
+    machine = load_machine(name).model_copy(update={"firmware": firmware, "command": command})
+    _, made = compensated_piece(HEAD + lines, machine)
+    assert np.max(deviation(made, made.encoded.phases)) < 0.07
+    for limits in made.encoded.limits:
+        assert isinstance(limits, MarlinLimits)
+        along_x = min(limits.accel_x_mm_s2, limits.travel_accel_mm_s2)
+        if name == "ender3":  # an axis keeps its own
+            assert along_x <= 5000.0
+        else:  # and a motor of a CoreXY what it makes where the head has that along a diagonal
+            assert limits.travel_accel_mm_s2 == 5000.0
+            assert limits.accel_x_mm_s2 <= 5000.0 * 2**0.5 * (1 + 1e-9)
 
 
 # Words

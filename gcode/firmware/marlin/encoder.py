@@ -133,6 +133,23 @@ def stream_limits(
     )
 
 
+def _with_diagonals(limits: MarlinLimits, command: CommandLimits, *, corexy: bool) -> MarlinLimits:
+    """Return limits of a stream with the acceleration that X and Y bear together.
+
+    M204 holds along the way and M201 by motor (`planner.cpp`, `_populate_block`). With one figure
+    for both, cartesian axes have only sqrt(1/2) of it each along a diagonal, and so has the way on
+    a CoreXY, of which each motor makes sqrt(2) times as much there.
+    """
+    x, y = limits.accel_x_mm_s2, limits.accel_y_mm_s2
+    if not corexy:
+        both = math.hypot(x, y)
+        return replace(limits, print_accel_mm_s2=both, travel_accel_mm_s2=both)
+    if command.motors is not None and command.motors.accel_mm_s2 is not None:
+        return limits
+    diagonal = math.sqrt(2.0)
+    return replace(limits, accel_x_mm_s2=diagonal * x, accel_y_mm_s2=diagonal * y)
+
+
 class _Way(NamedTuple):
     """A way to encode a piece.
 
@@ -143,12 +160,15 @@ class _Way(NamedTuple):
     late : bool
         The piece came late: steps of E are in moves that bear them, moves are long enough for the
         queue to stop within its own, and first lines do not hold up the ones after them.
+    diagonal : bool
+        X and Y together have what they bear.
     earlier : float
         Share of their lateness in the pass before by which lines are to end earlier, on average.
     """
 
     least_hz: float
     late: bool
+    diagonal: bool = False
     earlier: float = 0.0
 
 
@@ -233,8 +253,9 @@ class MarlinEncoder:
         ways = [
             _Way(self._start_hz, late=False),
             _Way(self._start_hz, late=True),
-            _Way(np.inf, late=True),
-            _Way(np.inf, late=True, earlier=_EARLIER),
+            _Way(self._start_hz, late=True, diagonal=True),
+            _Way(np.inf, late=True, diagonal=True),
+            _Way(np.inf, late=True, diagonal=True, earlier=_EARLIER),
         ]
         for way in dict.fromkeys(ways):
             encoded, on_time = self._in_one_way(piece, timeline, segments, limits, way)
@@ -263,6 +284,8 @@ class MarlinEncoder:
         moves = self._where_the_file_says(piece, timeline, moves)
         begin_s = float(timeline.start_s[0])
         speed = np.where(moves.row < 0, self._fastest_mm_s, piece.moves.speed_mm_s[moves.row])
+        if way.diagonal:
+            limits = _with_diagonals(limits, self._command, corexy=self._corexy)
         levels = StreamLevels(
             moves,
             limits,
