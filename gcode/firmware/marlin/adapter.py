@@ -12,15 +12,11 @@ from numpy.typing import NDArray
 from stillpath.gcode.dialect import Dialect
 from stillpath.gcode.firmware.base import scaled
 from stillpath.gcode.firmware.marlin.advice import MarlinAdviser
-from stillpath.gcode.firmware.marlin.encoder import (
-    DEVIATION_MM,
-    STEEPEST,
-    MarlinEncoder,
-    stream_limits,
-)
+from stillpath.gcode.firmware.marlin.encoder import MarlinEncoder
 from stillpath.gcode.firmware.marlin.limits import MarlinLimits, initial_limits
 from stillpath.gcode.firmware.marlin.planner import Planner
 from stillpath.gcode.firmware.marlin.stream_commands import MarlinStreamCommands
+from stillpath.gcode.firmware.marlin.stream_limits import DEVIATION_MM, STEEPEST, stream_limits
 from stillpath.gcode.types import Limits
 from stillpath.models.firmware import Marlin
 from stillpath.models.machine import CommandLimits, Machine
