@@ -281,7 +281,7 @@ class MarlinEncoder:
             actual = phases.lasts_s
             miss = actual - predicted
             if earlier:
-                late_s = lateness_s(moves, phases)
+                late_s = lateness_s(moves, phases, after_first=True)
                 off = float(np.max(np.abs(late_s) * np.where(ours, feedrate, 0.0), initial=0.0))
                 if off < best[0]:
                     best = off, feedrate.copy(), phases

@@ -133,7 +133,7 @@ class StreamLevels:
     def _behind(self, phases: Phases) -> NDArray[np.float64]:
         """Return the lag of each line's end relative to the limit, shape (n,)."""
         most_mm = np.where(self._feeds, _BEHIND_MM, _TRAVEL_BEHIND_MM)
-        late_s = lateness_s(self._moves, phases)
+        late_s = lateness_s(self._moves, phases, after_first=True)
         return np.asarray(late_s * self._speed_mm_s / most_mm)
 
     def _to_stop(
