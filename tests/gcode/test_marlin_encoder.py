@@ -263,6 +263,7 @@ def test_the_shaper_of_the_firmware() -> None:
         ({"variant": "bugfix"}, "2.1.2"),
         ({"ft_motion": True}, "M493 S0"),
         ({"board": "avr"}, "8-bit"),
+        ({"block_buffer_size": 4}, "BLOCK_BUFFER_SIZE 8 or more"),
         ({"min_steps_per_segment": 20}, "MIN_STEPS_PER_SEGMENT 1"),
         (
             {"min_steps_per_segment": 6, "steps_per_mm": PerAxis(x=160, y=40, z=400, e=93)},
