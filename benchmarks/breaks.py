@@ -113,8 +113,8 @@ def steps_at_breaks(
     rng = np.random.default_rng(20261124)
     reader = Interpreter(machine)
     steps: list[list[float]] = []
-    # Marlin's lines have accelerations of X and Y of their own.
-    mark = 3 if machine.firmware.kind == "marlin" else 1
+    # Marlin's lines, and late pieces, have accelerations of X and Y of their own.
+    mark = 1 if machine.firmware.kind == "klipper" else 3
     with written.open("rb") as file:
         blocks = [b for data in iter(lambda: file.read(1 << 20), b"") for b in reader.push(data)]
     blocks += reader.flush()

@@ -75,16 +75,18 @@ class Totals:
 
     def add_piece(self, made: CompensatedPiece, executed: Phases, gap_mm: np.ndarray) -> None:
         """Add a piece as written, and the distance of its motion from its command."""
-        timeline, segments = made.timeline, made.segments
+        timeline, encoded = made.timeline, made.encoded
         seconds = executed.duration_s + float(timeline.start_s[0])
         self.time_s += seconds
         self.compensated_s += seconds
         extruding_s = DT_S * np.count_nonzero(made.extruding)
         self.extruding_s += extruding_s
         self.rippling_s += extruding_s if made.keeps_ripple else 0.0
-        self.segments += len(segments)
-        if len(segments):
-            rate = np.bincount((segments.end_s - 1e-9).astype(np.int64))
+        # As written: an encoder that puts vertices on steps adds some to those of the fit.
+        begin_s = encoded.start_s[encoded.row < 0]
+        self.segments += len(begin_s)
+        if len(begin_s):
+            rate = np.bincount(begin_s.astype(np.int64))
             self.peak_segments_per_s = max(self.peak_segments_per_s, float(rate.max()))
         self.peak_velocity_mm_s = max(self.peak_velocity_mm_s, made.step_mm / DT_S)
         self.peak_accel_mm_s2 = max(self.peak_accel_mm_s2, made.bend_mm / DT_S**2)

@@ -22,6 +22,7 @@ __all__ = [
     "encoded_piece",
     "group_durations",
     "interleave",
+    "lateness_s",
     "limits_in_force",
     "to_units",
 ]
@@ -223,6 +224,25 @@ def encoded_piece(
         rest_s=rest_s,
         phases=phases,
     )
+
+
+def lateness_s(
+    moves: Interleaved, phases: Phases, *, after_first: bool = False
+) -> NDArray[np.float64]:
+    """Return how late each segment ends, shape (n,), counted from where its stretch begins.
+
+    Parameters
+    ----------
+    after_first : bool
+        Count from the end of the stretch's first segment instead.
+    """
+    ours = moves.row < 0
+    first = ours & np.append(True, ~ours)[:-1]
+    begin = np.maximum.accumulate(np.where(first, np.arange(len(first)), 0))
+    lost_s = np.where(ours, phases.lasts_s - moves.planned_s, 0.0)
+    passed_s = np.cumsum(np.where(first, 0.0, lost_s))
+    late_s = passed_s - passed_s[begin]
+    return np.where(ours, late_s if after_first else late_s + lost_s[begin], 0.0)
 
 
 def group_durations(phases: Phases, groups: Sequence[Group]) -> NDArray[np.float64]:

@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stillpath.gcode.firmware.marlin._encoder_kernels import spread_advance
-from stillpath.gcode.firmware.marlin.encoder import stream_limits
 from stillpath.gcode.firmware.marlin.limits import advance_speed_mm_s, initial_limits
 from stillpath.gcode.firmware.marlin.planner import Planner
 from stillpath.gcode.firmware.marlin.stream_commands import MarlinStreamCommands
+from stillpath.gcode.firmware.marlin.stream_limits import stream_limits
 from stillpath.gcode.sampler import sample_phases
 from stillpath.models.firmware import Marlin
 from stillpath.models.firmware.marlin import PerAxis

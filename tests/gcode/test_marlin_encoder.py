@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stillpath.gcode.firmware.encoding import as_moves
+from stillpath.gcode.firmware.marlin import encoder
 from stillpath.gcode.firmware.marlin._encoder_kernels import (
     Blocks,
     assign_rates,
@@ -19,18 +20,23 @@ from stillpath.gcode.firmware.marlin._encoder_kernels import (
     thin,
 )
 from stillpath.gcode.firmware.marlin.adapter import STEEPEST_MESH, MarlinAdapter
-from stillpath.gcode.firmware.marlin.encoder import stream_limits
 from stillpath.gcode.firmware.marlin.limits import MarlinLimits, initial_limits
 from stillpath.gcode.firmware.marlin.planner import Planner
 from stillpath.gcode.firmware.marlin.stream_commands import MarlinStreamCommands
+from stillpath.gcode.firmware.marlin.stream_limits import stream_limits
 from stillpath.gcode.firmware.planning import join_phases
+from stillpath.gcode.firmware.vertices import Lattice, vertices_on_steps
 from stillpath.gcode.interpreter import Interpreter
+from stillpath.gcode.segments import Segments
+from stillpath.gcode.timeline import Timeline
 from stillpath.models.firmware import Marlin
 from stillpath.models.firmware.marlin import MarlinPlanner, MarlinShaper, PerAxis
 from stillpath.models.machine import CommandLimits, Machine
 from stillpath.models.store import load_machine
+from stillpath.pipeline.piece_compensator import deviation
 from tests.compensating import compensated
 from tests.gcode.cutting import HEAD, MARLIN_PLANNER
+from tests.gcode.cutting import compensated as compensated_piece
 from tests.gcode.prints import polygon
 from tests.gcode.states import differences, tagged
 
@@ -165,6 +171,50 @@ def test_with_classic_jerk_fast_moves_start_as_slowly_as_the_one_before(
     assert np.abs(late_s[1:-1] - late_s[1]).max() < 1.3e-3 * first_steps
 
 
+FAST = "G1 X200 Y190 E6 F18000\nG1 X20 Y150 E6\nG1 X190 Y20 E6\nG1 X60 Y200 E6\n"
+
+
+def without_room(name: str) -> Machine:
+    """The motors bear no more than the printer asks of one axis."""
+    accel = PerAxis(x=5000.0, y=5000.0, z=200.0, e=5000.0)
+    planner = MARLIN_PLANNER.model_copy(
+        update={"max_accel_mm_s2": accel, "accel_mm_s2": 5000.0, "travel_accel_mm_s2": 5000.0}
+    )
+    firmware = FIRMWARE.model_copy(
+        update={"planner": planner, "steps_per_mm": PerAxis(x=80.0, y=80.0, z=400.0, e=400.0)}
+    )
+    command = CommandLimits(accel_mm_s2=5000.0)
+    return load_machine(name).model_copy(update={"firmware": firmware, "command": command})
+
+
+@pytest.mark.parametrize("name", ["ender3", "voron-v24-250"])
+def test_a_late_piece_has_what_x_and_y_bear_together(name: str) -> None:
+    """M204 as one axis's limit left each only sqrt(1/2) of it on a diagonal: millimetres late."""
+    _, made = compensated_piece(HEAD + FAST, without_room(name))
+    assert np.max(deviation(made, made.encoded.phases)) < 0.07
+    for limits in made.encoded.limits:
+        assert isinstance(limits, MarlinLimits)
+        along_x = min(limits.accel_x_mm_s2, limits.travel_accel_mm_s2)
+        if name == "ender3":  # an axis keeps its own
+            assert along_x <= 5000.0
+        else:  # and a motor of a CoreXY what it makes where the head has that along a diagonal
+            assert limits.travel_accel_mm_s2 == 5000.0
+            assert limits.accel_x_mm_s2 <= 5000.0 * 2**0.5 * (1 + 1e-9)
+
+
+def test_a_late_piece_is_searched_for_vertices_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each attempt to be on time repeated the search, with the same result."""
+    searched: list[tuple[Segments, float]] = []
+
+    def watched(lattice: Lattice, timeline: Timeline, segments: Segments) -> Segments:
+        searched.append((segments, lattice.fast_accel_mm_s2))
+        return vertices_on_steps(lattice, timeline, segments)
+
+    monkeypatch.setattr(encoder, "vertices_on_steps", watched)
+    compensated_piece(HEAD + FAST, without_room("ender3"))
+    assert len({(id(segments), accel) for segments, accel in searched}) == len(searched) > 0
+
+
 # Words
 
 
@@ -213,6 +263,7 @@ def test_the_shaper_of_the_firmware() -> None:
         ({"variant": "bugfix"}, "2.1.2"),
         ({"ft_motion": True}, "M493 S0"),
         ({"board": "avr"}, "8-bit"),
+        ({"block_buffer_size": 4}, "BLOCK_BUFFER_SIZE 8 or more"),
         ({"min_steps_per_segment": 20}, "MIN_STEPS_PER_SEGMENT 1"),
         (
             {"min_steps_per_segment": 6, "steps_per_mm": PerAxis(x=160, y=40, z=400, e=93)},

@@ -8,9 +8,9 @@ import pytest
 from numpy.typing import NDArray
 
 from stillpath.gcode.firmware.encoding import Interleaved
-from stillpath.gcode.firmware.marlin.encoder import stream_limits
 from stillpath.gcode.firmware.marlin.limits import initial_limits
 from stillpath.gcode.firmware.marlin.starting import StreamLevels, gentle_accel_mm_s2
+from stillpath.gcode.firmware.marlin.stream_limits import stream_limits
 from stillpath.gcode.types import Phases
 from stillpath.models.firmware import Marlin
 from stillpath.models.machine import CommandLimits

@@ -67,6 +67,11 @@ def test_compensated(kind: str, beside_a_rest: bytes, tmp_path: Path, cache: Pat
     late_s = result.time_s - result.original_time_s
     assert abs(late_s) < 9e-3 * result.original_time_s + waits_s
     assert result.filament_error_mm < 1e-2
+    # The lines that the printer reads, not those of the fit behind them.
+    in_streams = re.findall(rb"; stillpath: stream on\n(.*?); stillpath: stream off", written, re.S)
+    lines = sum(len(re.findall(rb"^G1 .*[XY]", text, re.M)) for text in in_streams)
+    assert result.segments == pytest.approx(lines, rel=0.02)
+    assert result.peak_segments_per_s > result.segments_per_s > 20.0
 
 
 @pytest.mark.parametrize("kind", ["klipper", *KINDS])

@@ -12,15 +12,11 @@ from numpy.typing import NDArray
 from stillpath.gcode.dialect import Dialect
 from stillpath.gcode.firmware.base import scaled
 from stillpath.gcode.firmware.marlin.advice import MarlinAdviser
-from stillpath.gcode.firmware.marlin.encoder import (
-    DEVIATION_MM,
-    STEEPEST,
-    MarlinEncoder,
-    stream_limits,
-)
+from stillpath.gcode.firmware.marlin.encoder import MarlinEncoder
 from stillpath.gcode.firmware.marlin.limits import MarlinLimits, initial_limits
 from stillpath.gcode.firmware.marlin.planner import Planner
 from stillpath.gcode.firmware.marlin.stream_commands import MarlinStreamCommands
+from stillpath.gcode.firmware.marlin.stream_limits import DEVIATION_MM, STEEPEST, stream_limits
 from stillpath.gcode.types import Limits
 from stillpath.models.firmware import Marlin
 from stillpath.models.machine import CommandLimits, Machine
@@ -33,6 +29,9 @@ STEEPEST_MESH = 0.1
 LONGEST_LEAST_MM = 0.1
 """Longest of the shortest moves that a firmware may execute: a turn straight back is cut off by a
 quarter of it, and a stand in the middle of a stretch is crossed by half of it (docs/marlin.md)."""
+
+LEAST_BUFFER = 8
+"""With 4 blocks one is known behind the one that starts, and every other move would stop."""
 
 _ACCELERATIONS = ("accel_x_mm_s2", "accel_y_mm_s2", "print_accel_mm_s2", "travel_accel_mm_s2")
 
@@ -108,7 +107,17 @@ class MarlinAdapter:
                 "(Configuration_adv.h) and say so in min_steps_per_segment, set finer "
                 "microsteps, or " + _ALTERNATIVE
             )
-        slope = self._mesh_slope
+        return self._beyond_reach()
+
+    def _beyond_reach(self) -> str | None:
+        """Return why queue or bed leave a stream no room, or None."""
+        blocks, slope = self._firmware.block_buffer_size, self._mesh_slope
+        if blocks < LEAST_BUFFER:
+            return (
+                f"its queue of {blocks} blocks (block_buffer_size) is too short to look ahead, and "
+                f"moves end at a stand: build it with BLOCK_BUFFER_SIZE {LEAST_BUFFER} or more, or "
+                + _ALTERNATIVE
+            )
         if slope > STEEPEST_MESH:
             return (
                 f"the bed mesh rises by up to {slope:g} mm per mm (mesh_slope), and Z, which "

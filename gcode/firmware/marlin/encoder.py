@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
-from stillpath.gcode.firmware.base import corner_step_mm_s, square_corner_mm_s
 from stillpath.gcode.firmware.encoding import (
     UNITS_PER_MM,
     Encoded,
@@ -27,6 +26,7 @@ from stillpath.gcode.firmware.encoding import (
     encoded_piece,
     group_durations,
     interleave,
+    lateness_s,
     limits_in_force,
     to_units,
 )
@@ -39,13 +39,13 @@ from stillpath.gcode.firmware.marlin._encoder_kernels import (
 )
 from stillpath.gcode.firmware.marlin.climbing import climb_in_long_moves
 from stillpath.gcode.firmware.marlin.feeding import with_advance, with_placed_steps
-from stillpath.gcode.firmware.marlin.limits import MarlinLimits, advance_speed_mm_s, without_advance
+from stillpath.gcode.firmware.marlin.limits import MarlinLimits
 from stillpath.gcode.firmware.marlin.planner import Planner, planner_facts
 from stillpath.gcode.firmware.marlin.starting import (
     StreamLevels,
     gentle_accel_mm_s2,
-    lateness_s,
 )
+from stillpath.gcode.firmware.marlin.stream_limits import stream_limits, with_diagonals
 from stillpath.gcode.firmware.planning import join_phases
 from stillpath.gcode.firmware.vertices import Lattice, steps_within, vertices_on_steps
 from stillpath.gcode.pieces import Piece
@@ -53,24 +53,12 @@ from stillpath.gcode.segments import Segments
 from stillpath.gcode.timeline import Group, Timeline
 from stillpath.gcode.types import Limits, Phases
 from stillpath.models.firmware import Marlin
-from stillpath.models.machine import CommandLimits, MotorLimits
+from stillpath.models.machine import CommandLimits
 
-__all__ = ["DEVIATION_MM", "STEEPEST", "MarlinEncoder", "stream_limits"]
+__all__ = ["MarlinEncoder"]
 
-STEEPEST = 0.01
-"""Steepest climb of a stream on top of the bed mesh's slope; Z's limits are raised for both."""
-STREAM_E_ACCEL_MM_S2 = 300_000.0
-"""High enough that linear advance never limits X and Y, but within the 32 bits of Marlin's
-acceleration_rate."""
-STREAM_MESH_ACCEL_MM_S2 = 20_000.0
-"""Acceleration of Z where it follows a mesh: a step of 2.5 um in a third of a ms."""
-STREAM_E_JERK_MM_S = 100.0
-DEVIATION_MM = (0.01, 0.3)
-"""Range of M205 J (Marlin/src/gcode/config/M200-M205.cpp, 2.0.x and 2.1.x)."""
-
-_ROOM, _DIAGONAL = 1.05, 1.5
-"""Speeds above the command's: of one axis, since vertices lie on whole steps, and of X and Y
-together along a diagonal."""
+_DIAGONAL = 1.5
+"""Speed of X and Y together above the command's for one axis."""
 _CALM = 0.6
 """Share of the motors' permitted speed step; the rest is for making up lost time."""
 _PASSES = 10
@@ -86,53 +74,6 @@ _BYTES_PER_LINE = 36.0
 tenth more for the lines that set accelerations."""
 
 
-def stream_limits(
-    own: MarlinLimits, command: CommandLimits, mesh_slope: float = 0.0
-) -> MarlinLimits:
-    """Return the limits of a stream where the file has set `own`.
-
-    X and Y have the motors' limits, so that the stream may be interrupted anywhere. Retractions
-    keep their acceleration. Linear advance is off, and the extruder's limit is raised by the speed
-    that it adds to the filament.
-    """
-    feed = 2.0 * own.feedrate_e_mm_s
-    if own.linear_advance_k_s > 0.0:
-        feed += 2.0 * max(advance_speed_mm_s(own, classic_jerk=jerk) for jerk in (False, True))
-    x, y = command.of("x"), command.of("y")
-    accel, step = (
-        max(x.accel_mm_s2, y.accel_mm_s2),
-        max(corner_step_mm_s(x), corner_step_mm_s(y)),
-    )
-    motors = command.motors or MotorLimits()
-    slope = mesh_slope + STEEPEST
-    # Along a mesh Z takes a step within one segment, and none within the next.
-    hop = STREAM_MESH_ACCEL_MM_S2 if mesh_slope > 0.0 else 0.0
-    # By junction deviation a corner is passed as by Klipper's square corner velocity.
-    deviation_mm = (math.sqrt(2.0) - 1.0) * square_corner_mm_s(command) ** 2 / accel
-    return replace(
-        without_advance(own),
-        # Of motors, also on a CoreXY.
-        accel_x_mm_s2=motors.accel_mm_s2 or x.accel_mm_s2,
-        accel_y_mm_s2=motors.accel_mm_s2 or y.accel_mm_s2,
-        accel_z_mm_s2=max(own.accel_z_mm_s2, slope * accel, hop),
-        accel_e_mm_s2=STREAM_E_ACCEL_MM_S2,
-        feedrate_x_mm_s=max(own.feedrate_x_mm_s, _ROOM * (motors.velocity_mm_s or x.velocity_mm_s)),
-        feedrate_y_mm_s=max(own.feedrate_y_mm_s, _ROOM * (motors.velocity_mm_s or y.velocity_mm_s)),
-        feedrate_e_mm_s=feed,
-        print_accel_mm_s2=accel,
-        travel_accel_mm_s2=accel,
-        # It limits the step of each axis.
-        jerk_x_mm_s=round(corner_step_mm_s(x) / math.sqrt(2.0), 2),
-        jerk_y_mm_s=round(corner_step_mm_s(y) / math.sqrt(2.0), 2),
-        jerk_z_mm_s=max(own.jerk_z_mm_s, slope * step),
-        jerk_e_mm_s=max(own.jerk_e_mm_s, STREAM_E_JERK_MM_S),
-        junction_deviation_mm=min(max(deviation_mm, DEVIATION_MM[0]), DEVIATION_MM[1]),
-        min_segment_time_us=0.0,
-        min_feedrate_mm_s=0.0,
-        min_travel_feedrate_mm_s=0.0,
-    )
-
-
 class _Way(NamedTuple):
     """A way to encode a piece.
 
@@ -143,12 +84,15 @@ class _Way(NamedTuple):
     late : bool
         The piece came late: steps of E are in moves that bear them, moves are long enough for the
         queue to stop within its own, and first lines do not hold up the ones after them.
+    diagonal : bool
+        X and Y together have what they bear.
     earlier : float
         Share of their lateness in the pass before by which lines are to end earlier, on average.
     """
 
     least_hz: float
     late: bool
+    diagonal: bool = False
     earlier: float = 0.0
 
 
@@ -233,26 +177,30 @@ class MarlinEncoder:
         ways = [
             _Way(self._start_hz, late=False),
             _Way(self._start_hz, late=True),
-            _Way(np.inf, late=True),
-            _Way(np.inf, late=True, earlier=_EARLIER),
+            _Way(self._start_hz, late=True, diagonal=True),
+            _Way(np.inf, late=True, diagonal=True),
+            _Way(np.inf, late=True, diagonal=True, earlier=_EARLIER),
         ]
+        vertices: dict[float, Segments] = {}
+        placed: dict[tuple[float, bool], Interleaved] = {}
         for way in dict.fromkeys(ways):
-            encoded, on_time = self._in_one_way(piece, timeline, segments, limits, way)
+            least_hz, place = way.least_hz, (way.least_hz, way.late)
+            if least_hz not in vertices:
+                vertices[least_hz] = self._vertices(timeline, segments, least_hz)
+            if place not in placed:
+                wish = vertices[least_hz]
+                placed[place] = self._moves(piece, timeline, wish, limits, way)
+            encoded, on_time = self._in_one_way(piece, timeline, placed[place], limits, way)
             if on_time:
                 break
         return encoded
 
-    def _in_one_way(
-        self,
-        piece: Piece,
-        timeline: Timeline,
-        segments: Segments,
-        limits: MarlinLimits,
-        way: _Way,
-    ) -> tuple[Encoded, bool]:
-        """Encode in one way; return also whether the motion keeps up."""
+    def _moves(
+        self, piece: Piece, timeline: Timeline, wish: Segments, limits: MarlinLimits, way: _Way
+    ) -> Interleaved:
+        """Return all moves, ours on whole steps."""
         places = way.late and self._turns_by_feed
-        on_steps = self._on_steps(timeline, segments, limits, way)
+        on_steps = self._on_steps(timeline, wish, limits, way)
         segments = with_advance(self._firmware, piece, timeline, on_steps, whole=not places)
         if places:
             accel = gentle_accel_mm_s2(self._command, way.least_hz)
@@ -260,9 +208,16 @@ class MarlinEncoder:
                 timeline, segments, self._scale[3], accel, corexy=self._corexy
             )
         moves = interleave(piece, timeline, segments, 1)
-        moves = self._where_the_file_says(piece, timeline, moves)
+        return self._where_the_file_says(piece, timeline, moves)
+
+    def _in_one_way(
+        self, piece: Piece, timeline: Timeline, moves: Interleaved, limits: MarlinLimits, way: _Way
+    ) -> tuple[Encoded, bool]:
+        """Encode in one way; return also whether the motion keeps up."""
         begin_s = float(timeline.start_s[0])
         speed = np.where(moves.row < 0, self._fastest_mm_s, piece.moves.speed_mm_s[moves.row])
+        if way.diagonal:
+            limits = with_diagonals(limits, self._command, corexy=self._corexy)
         levels = StreamLevels(
             moves,
             limits,
@@ -270,7 +225,7 @@ class MarlinEncoder:
             least_hz=way.least_hz,
             ahead=self._ahead,
             corexy=self._corexy,
-            steps_placed=places,
+            steps_placed=way.late and self._turns_by_feed,
         )
         correction_s = np.zeros(len(moves.row))
         while True:
@@ -326,7 +281,7 @@ class MarlinEncoder:
             actual = phases.lasts_s
             miss = actual - predicted
             if earlier:
-                late_s = lateness_s(moves, phases)
+                late_s = lateness_s(moves, phases, after_first=True)
                 off = float(np.max(np.abs(late_s) * np.where(ours, feedrate, 0.0), initial=0.0))
                 if off < best[0]:
                     best = off, feedrate.copy(), phases
@@ -358,21 +313,27 @@ class MarlinEncoder:
         position[last] = np.where(same, to_units(ends), position[last])
         return replace(moves, position=position, begin=to_units(piece.moves.start_mm[0]))
 
-    def _on_steps(
-        self, timeline: Timeline, segments: Segments, limits: MarlinLimits, way: _Way
-    ) -> Segments:
-        """Put the vertices on whole steps, and leave out those that would be swallowed."""
+    def _vertices(self, timeline: Timeline, segments: Segments, least_hz: float) -> Segments:
+        """Put the vertices of a fit on whole steps."""
         if len(segments) == 0:
             # X and Y of the whole piece move by less than a step.
             return segments
-        scale = self._scale[:3]
-        gentle = gentle_accel_mm_s2(self._command, way.least_hz)
+        gentle = gentle_accel_mm_s2(self._command, least_hz)
         lattice = replace(self._lattice, fast_accel_mm_s2=gentle)
-        wish = vertices_on_steps(lattice, timeline, segments)
+        return vertices_on_steps(lattice, timeline, segments)
+
+    def _on_steps(
+        self, timeline: Timeline, wish: Segments, limits: MarlinLimits, way: _Way
+    ) -> Segments:
+        """Leave out vertices that would be swallowed, and place the steps of a climb."""
+        if len(wish) == 0:
+            return wish
+        scale = self._scale[:3]
         steps = np.round(wish.end_mm[:3].T * scale).astype(np.int64)
         begin = np.round(timeline.group_start_mm[:, :3] * scale).astype(np.int64)
         keep, room = np.ones(len(wish), np.bool_), np.zeros(len(wish))
         if way.late:
+            gentle = gentle_accel_mm_s2(self._command, way.least_hz)
             room = self._room_to_stop(wish, timeline, gentle)
         thin(
             steps,

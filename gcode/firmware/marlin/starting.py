@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 
-from stillpath.gcode.firmware.encoding import Interleaved
+from stillpath.gcode.firmware.encoding import Interleaved, lateness_s
 from stillpath.gcode.firmware.marlin.limits import MarlinLimits
 from stillpath.gcode.types import Phases
 from stillpath.models.machine import CommandLimits
 
-__all__ = ["StreamLevels", "gentle_accel_mm_s2", "lateness_s"]
+__all__ = ["StreamLevels", "gentle_accel_mm_s2"]
 
 _WITHIN_S = 1e-3
 """Time in which a motor can follow its speed step."""
@@ -133,7 +133,7 @@ class StreamLevels:
     def _behind(self, phases: Phases) -> NDArray[np.float64]:
         """Return the lag of each line's end relative to the limit, shape (n,)."""
         most_mm = np.where(self._feeds, _BEHIND_MM, _TRAVEL_BEHIND_MM)
-        late_s = lateness_s(self._moves, phases)
+        late_s = lateness_s(self._moves, phases, after_first=True)
         return np.asarray(late_s * self._speed_mm_s / most_mm)
 
     def _to_stop(
@@ -161,15 +161,6 @@ class StreamLevels:
             now = int(level[i]) if self._fast[i] else max(now, int(level[i]))
             level[i] = now
         return level
-
-
-def lateness_s(moves: Interleaved, phases: Phases) -> NDArray[np.float64]:
-    """Return how late each line of a stream ends, counted from its stretch's first, shape (n,)."""
-    ours = moves.row < 0
-    first = ours & np.append(True, ~ours)[:-1]
-    begin = np.maximum.accumulate(np.where(first, np.arange(len(first)), 0))
-    passed_s = np.cumsum(np.where(ours & ~first, phases.lasts_s - moves.planned_s, 0.0))
-    return np.where(ours, passed_s - passed_s[begin], 0.0)
 
 
 def _needed(

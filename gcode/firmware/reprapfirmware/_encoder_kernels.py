@@ -177,10 +177,10 @@ def keep_apart(
     crowded: NDArray[np.bool_],
     final: NDArray[np.bool_],
     begin_s: NDArray[np.float64],
-    least_s: float,
+    least_s: NDArray[np.float64],
     keep: NDArray[np.bool_],
 ) -> None:
-    """Drop crowded ends that come sooner than `least_s` after the one before.
+    """Drop crowded ends that come sooner than `least_s[i]` after the one before.
 
     `begin_s[i]` is when the stretch of segment i begins; ends with `final` set stay.
     """
@@ -188,6 +188,6 @@ def keep_apart(
     for i in range(len(end_s)):
         if i == 0 or final[i - 1]:
             last = begin_s[i]
-        keep[i] = final[i] or not crowded[i] or end_s[i] - last >= least_s - 1e-9
+        keep[i] = final[i] or not crowded[i] or end_s[i] - last >= least_s[i] - 1e-9
         if keep[i]:
             last = end_s[i]

@@ -12,7 +12,12 @@ from numpy.typing import NDArray
 from stillpath.gcode.dialect import Dialect
 from stillpath.gcode.firmware.base import scaled
 from stillpath.gcode.firmware.reprapfirmware.advice import RepRapAdviser
-from stillpath.gcode.firmware.reprapfirmware.encoder import STEEPEST, RepRapEncoder, stream_limits
+from stillpath.gcode.firmware.reprapfirmware.encoder import (
+    STEEPEST,
+    RepRapEncoder,
+    stream_limits,
+    with_diagonals,
+)
 from stillpath.gcode.firmware.reprapfirmware.limits import RepRapLimits
 from stillpath.gcode.firmware.reprapfirmware.planner import GRACE_S, RepRapPlanner, on_steps
 from stillpath.gcode.firmware.reprapfirmware.stream_commands import RepRapStreamCommands
@@ -92,7 +97,9 @@ class RepRapAdapter:
         """Return an encoder of the stream."""
         machine = self._machine
         travel_mm = [(machine.travel[a].min_mm, machine.travel[a].max_mm) for a in ("x", "y")]
-        return RepRapEncoder(self._firmware, machine.kinematics, self._stream, travel_mm)
+        corexy = machine.kinematics == "corexy"
+        late = with_diagonals(self._stream, machine.command, corexy=corexy)
+        return RepRapEncoder(self._firmware, machine.kinematics, self._stream, travel_mm, late)
 
     def stream_commands(self) -> RepRapStreamCommands:
         """Return RepRapFirmware's words."""

@@ -22,10 +22,12 @@ from stillpath.gcode.firmware._encoding_kernels import MoveLimits
 from stillpath.gcode.firmware.advance import feed_at_ends
 from stillpath.gcode.firmware.encoding import (
     Encoded,
+    Interleaved,
     as_moves,
     encoded_piece,
     group_durations,
     interleave,
+    lateness_s,
     limits_in_force,
 )
 from stillpath.gcode.firmware.reprapfirmware._encoder_kernels import assign_speeds, keep_apart
@@ -39,7 +41,7 @@ from stillpath.gcode.types import Limits, Phases
 from stillpath.models.firmware import RepRapFirmware
 from stillpath.models.machine import CommandLimits
 
-__all__ = ["STEEPEST", "RepRapEncoder", "stream_limits"]
+__all__ = ["STEEPEST", "RepRapEncoder", "stream_limits", "with_diagonals"]
 
 STEEPEST = 0.01
 """Steepest climb of a stream on top of the bed mesh's slope; Z's limits are raised for both."""
@@ -55,6 +57,12 @@ pressure advance steps by twice the jerk."""
 _DIAGONAL = 1.5
 """Ratio of a CoreXY motor's speed to the path's, and of the changes of Z's direction."""
 _PASSES = 4
+_RING_SHARE = 0.5
+"""Share of half the ring in which late pieces are to be able to stop."""
+_BEHIND_MM, _TRAVEL_BEHIND_MM = 0.04, 0.12
+"""Lag, with and without filament, from which a piece is not on time."""
+_AHEAD_MM = 0.2
+"""Lead from which it is not: corrections that do not settle send it ahead of its times."""
 _EXACT_S = 2e-6
 _LEAST_S = 0.025
 """As `prepare_least_s` of today's firmware; with an older one, too, lines must be read in time."""
@@ -115,6 +123,23 @@ def stream_limits(
     )
 
 
+def with_diagonals(limits: RepRapLimits, command: CommandLimits, *, corexy: bool) -> RepRapLimits:
+    """Return limits of a stream with the acceleration that X and Y bear together.
+
+    M204 holds along the way, M201 by axis and, on a CoreXY, by motor (`DDA.cpp`,
+    `InitStandardMove`; `CoreKinematics.cpp`).
+    """
+    x, y = limits.accel_x_mm_s2, limits.accel_y_mm_s2
+    if not corexy:
+        both = math.hypot(x, y)
+        return replace(limits, print_accel_mm_s2=both, travel_accel_mm_s2=both)
+    most = _RAMP * command.speed_step_mm_s / 1e-3
+    if command.motors is not None and command.motors.accel_mm_s2 is not None:
+        most = min(most, command.motors.accel_mm_s2)
+    x, y = (max(one, min(math.sqrt(2.0) * one, most)) for one in (x, y))
+    return replace(limits, accel_x_mm_s2=x, accel_y_mm_s2=y)
+
+
 class RepRapEncoder:
     """Encode pieces for one machine.
 
@@ -125,6 +150,8 @@ class RepRapEncoder:
         What the stream runs under.
     travel_mm : sequence of (float, float), optional
         Least and largest X, and Y.
+    late_limits : RepRapLimits, optional
+        What pieces run under that are late otherwise; by default `limits`.
     """
 
     grid_mm = 1e-3
@@ -137,6 +164,7 @@ class RepRapEncoder:
         kinematics: str,
         limits: RepRapLimits,
         travel_mm: Sequence[tuple[float, float]] = ((-1e6, 1e6), (-1e6, 1e6)),
+        late_limits: RepRapLimits | None = None,
     ) -> None:
         self._firmware = firmware
         self._kinematics = kinematics
@@ -144,6 +172,7 @@ class RepRapEncoder:
         self._half_ring_s = max(firmware.prepare_least_s, _LEAST_S) + _POLL_S
         """Least duration of that many moves, so that the firmware freezes the next one in time."""
         self._limits = limits
+        self._late_limits = late_limits or limits
         per_mm = np.array([drive.steps_per_mm for drive in firmware.drives])
         low, high = steps_within(travel_mm, per_mm)
         self._lattice = Lattice(
@@ -172,14 +201,30 @@ class RepRapEncoder:
             If segments come faster than the firmware's queue can take them.
         """
         segments = self._sparse(timeline, _split_slow(timeline, segments))
-        segments = self._sparse(timeline, self._on_steps(timeline, segments))
+        segments = self._on_steps(timeline, segments)
+        first = self._sparse(timeline, segments)
+        encoded, behind_mm = self._timed(piece, timeline, first, self._limits)
+        # Behind short moves the ring knows too little to stop, so they stay slow.
+        for limits in dict.fromkeys((self._limits, self._late_limits)):
+            if behind_mm == 0.0:
+                break
+            longer = self._sparse(timeline, self._with_room(timeline, segments, limits))
+            other, other_mm = self._timed(piece, timeline, longer, limits)
+            if other_mm < behind_mm:
+                encoded, behind_mm = other, other_mm
+        return encoded
+
+    def _timed(
+        self, piece: Piece, timeline: Timeline, segments: Segments, stream: RepRapLimits
+    ) -> tuple[Encoded, float]:
+        """Choose filament and feedrates; return also lag or lead beyond its limit [mm], or 0."""
         segments = self._advanced(piece, timeline, segments)
         moves = interleave(piece, timeline, segments, 1)
         rows = moves.row
         places_mm = moves.places_mm()
         start_mm, end_mm = places_mm[:-1], places_mm[1:]
         ours = rows < 0
-        limits_id, limits = limits_in_force(piece, rows, [self._limits], np.zeros_like(rows))
+        limits_id, limits = limits_in_force(piece, rows, [stream], np.zeros_like(rows))
         allowed = self._allowed(start_mm, end_mm, limits_id, limits)
         asked = np.where(ours, np.inf, piece.moves.speed_mm_s[rows])
         speed = np.minimum(allowed.speed_mm_s, asked)
@@ -203,7 +248,8 @@ class RepRapEncoder:
                 break
             missed += miss if attempt == 0 else 0.5 * miss
         self._check_rate(plan, piece)
-        return encoded_piece(timeline, moves, self._limits, best, plan)
+        encoded = encoded_piece(timeline, moves, stream, best, plan)
+        return encoded, _behind_mm(moves, plan)
 
     def _sparse(self, timeline: Timeline, segments: Segments) -> Segments:
         """Drop vertices where segments come faster than the firmware's queue can take them."""
@@ -218,14 +264,20 @@ class RepRapEncoder:
         crowded = np.convolve(late[: len(segments)], np.ones(half))[: len(segments)] > 0.0
         if not np.any(crowded):
             return segments
-        keep = np.ones(len(segments), np.bool_)
-        keep_apart(segments.end_s, crowded, segments.final, begin_s, wanted_s / half, keep)
-        return replace(
-            segments,
-            end_s=segments.end_s[keep],
-            end_mm=segments.end_mm[:, keep],
-            group=segments.group[keep],
-        )
+        return _apart(segments, crowded, begin_s, np.full(len(segments), wanted_s / half))
+
+    def _with_room(self, timeline: Timeline, segments: Segments, stream: RepRapLimits) -> Segments:
+        """Drop vertices so that a share of half a ring is long enough to stop."""
+        start_s, start_mm = _starts(timeline, segments)
+        lasts_s, way_mm = segments.end_s - start_s, np.abs(segments.end_mm - start_mm)[:2]
+        limits = np.array([stream.accel_x_mm_s2, stream.accel_y_mm_s2])
+        if self._kinematics == "corexy":
+            # A motor makes at most what both axes make.
+            way_mm = np.broadcast_to(way_mm.sum(axis=0), way_mm.shape)
+        braking_s = np.max((way_mm.T / limits).T, axis=0) / lasts_s
+        least_s = braking_s / (2.0 * _RING_SHARE * self._half_ring)
+        every = np.ones(len(segments), np.bool_)
+        return _apart(segments, every, timeline.start_s[segments.group], least_s)
 
     def _advanced(self, piece: Piece, timeline: Timeline, segments: Segments) -> Segments:
         """Return segments with pressure advance in their filament."""
@@ -294,6 +346,33 @@ class RepRapEncoder:
                 "a longer queue (M595 P, firmware.ring_length) or a larger tolerance would do",
                 line=int(piece.moves.line[0]),
             )
+
+
+def _apart(
+    segments: Segments,
+    crowded: NDArray[np.bool_],
+    begin_s: NDArray[np.float64],
+    least_s: NDArray[np.float64],
+) -> Segments:
+    """Return segments without crowded ends that come too soon after the one before."""
+    keep = np.ones(len(segments), np.bool_)
+    keep_apart(segments.end_s, crowded, segments.final, begin_s, least_s, keep)
+    return replace(
+        segments,
+        end_s=segments.end_s[keep],
+        end_mm=segments.end_mm[:, keep],
+        group=segments.group[keep],
+    )
+
+
+def _behind_mm(moves: Interleaved, phases: Phases) -> float:
+    """Return by how much the largest lag, or lead, of a stretch exceeds what is borne, or 0."""
+    places_mm = moves.places_mm()
+    speed_mm_s = np.hypot(*np.diff(places_mm[:, :2], axis=0).T) / np.maximum(moves.planned_s, 1e-6)
+    borne_mm = np.where(np.diff(places_mm[:, 3]) > 0.0, _BEHIND_MM, _TRAVEL_BEHIND_MM)
+    lag_mm = lateness_s(moves, phases) * speed_mm_s
+    over_mm = np.maximum(lag_mm - borne_mm, -lag_mm - _AHEAD_MM)
+    return float(np.max(np.where(moves.row < 0, over_mm, 0.0), initial=0.0))
 
 
 def _starts(
