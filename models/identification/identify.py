@@ -490,7 +490,8 @@ class _AxisWork:
             log, aligned = self._used[number].measurement, self._aligned[number]
             assert isinstance(log, AccelerationLog)
             started_s = aligned.start_s - self._earlier_s
-            out.append(lateness(log, aligned.excitation, started_s, response, plant, others))
+            test, held_mm = aligned.excitation, self._friction_mm
+            out.append(lateness(log, test, started_s, response, plant, others, held_mm))
         return out
 
     def _rubbing(self, plants: PlantSetSpec) -> PlantSetSpec:
