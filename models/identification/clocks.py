@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.special import expit
 
 from stillpath.models.arrays import Array
 from stillpath.models.identification.excitation import regenerate
@@ -39,9 +40,15 @@ delays some of them only (docs/tried.md)."""
 _AGREE_S = 0.5e-3
 """Largest distance of a log from the median of its axis: alignment may miss by a whole swing."""
 _LEAST_APART_S, _MOST_APART_S = 0.05e-3, 1.5e-3
-"""Differences between the axes that are clear and plausible."""
+"""Differences between the axes that matter and are plausible."""
+_FRICTION_DELAY, _FRICTION_UNKNOWN = 8.0, 0.07
+"""Delay of the fundamental by friction, in c over accel_per_hz (`friction`), and the share of it
+that a friction of another kind (LuGre instead of Dahl) makes unsure: five printers without viscous
+guides, by somebody else, told .09 to .2 ms with friction of 3 to 21 um (2026-11-29)."""
 _USUAL_S = 0.25e-3
-"""Typical difference between the axes: guides that take a fifth of the damping at 40 Hz."""
+"""Typical difference between the axes: guides that take a fifth of the damping at 40 Hz. Every
+second machine is assumed to have none (rolling guides): a command that leads where nothing is late
+shears corners as much as one that does not lead where something is."""
 _LEAST_PLANTS = 3
 """How many plants of a set must tell a difference; by no more than what is usual may they differ.
 On 65 virtual printers (2026-11-29) 2 plants told .13 to .2 ms three times where there was none, and
@@ -68,12 +75,15 @@ class Lateness:
         Whether the log has the length of the test, so that it does begin with it.
     by_plant_s : ndarray, shape (plants, bands)
         The same against each plant of the set; none: there is no other.
+    unsure_s : float
+        Standard deviation of what all logs of the axis have in common, by its friction.
     """
 
     late_s: Array
     interval_s: float
     whole: bool
     by_plant_s: Array = field(default_factory=lambda: np.zeros((0, len(_BANDS))))
+    unsure_s: float = 0.0
 
 
 def lateness(
@@ -83,6 +93,7 @@ def lateness(
     response: FrequencyResponse,
     plant: PlantSpec,
     others: Sequence[PlantSpec] = (),
+    friction_mm: float = 0.0,
 ) -> Lateness:
     """Return how late an axis follows, against a plant that does not delay slow motion.
 
@@ -92,6 +103,8 @@ def lateness(
         The set: what else explains the logs.
     started_s : float
         Start of the test, on the clock of the log, to which `response` refers.
+    friction_mm : float
+        By how much dry friction holds the axis back, which was removed from the response.
     """
     interval_s = float(np.median(np.diff(log.time_s)))
     began_s = float(log.time_s[0]) - 0.5 * interval_s
@@ -99,7 +112,8 @@ def lateness(
     whole = -2.0 * interval_s <= beyond_s <= _STOP_S
     lags_s = np.array([_lags_s(response, one) for one in (plant, *others)])
     late_s = started_s - began_s + lags_s
-    return Lateness(late_s[0], interval_s, whole, late_s[1:])
+    delay_s = _FRICTION_DELAY * friction_mm / test.accel_per_hz_mm_s
+    return Lateness(late_s[0], interval_s, whole, late_s[1:], _FRICTION_UNKNOWN * delay_s)
 
 
 def timed(
@@ -119,10 +133,10 @@ def timed(
     apart_s = _alike(y_s - x_s)
     if max(intervals_s) > _SAME_RATE * min(intervals_s) or apart_s is None:
         return dict(found)
-    sd_s = float(np.mean(intervals_s)) * math.sqrt(sum(1 / len(k) for k in known.values()) / 12)
-    # What is to be expected of the difference, given that most machines have little.
-    share = 1.0 / (1.0 + (sd_s / _USUAL_S) ** 2)
-    later_s = share * abs(apart_s)
+    begins_s = float(np.mean(intervals_s)) * math.sqrt(sum(1 / len(k) for k in known.values()) / 12)
+    sd_s = math.hypot(begins_s, *(logs[0].unsure_s for logs in known.values()))
+    expected_s, unsure_s = _expected(apart_s, sd_s)
+    later_s = abs(expected_s)
     if not _LEAST_APART_S <= later_s <= _MOST_APART_S:
         return dict(found)
     later: Axis = "y" if apart_s > 0.0 else "x"
@@ -130,7 +144,7 @@ def timed(
     if not _plants_agree(known[later], x_s if later == "y" else y_s):
         return dict(found)
     one = found[later]
-    plants = _later(one.plants, later_s, 2.0 * sd_s * math.sqrt(share))
+    plants = _later(one.plants, later_s, 2.0 * unsure_s)
     # Leading by it where modes are damped against each other made two of four virtual printers
     # better and two worse (docs/tried.md).
     what = "ranges" if isinstance(plants.nominal, RelativeModesSpec) else "commands"
@@ -141,6 +155,19 @@ def timed(
     schedule = _later_places(one.schedule, later_s)
     notes = (*one.notes, note)
     return {**found, later: replace(one, plants=plants, schedule=schedule, notes=notes)}
+
+
+def _expected(told_s: float, sd_s: float) -> tuple[float, float]:
+    """Return what is to be expected of a difference that logs tell, and its standard deviation.
+
+    Every second machine has none, that of the others is normal (`_USUAL_S`).
+    """
+    wide_s = math.hypot(sd_s, _USUAL_S)
+    odds = math.log(sd_s / wide_s) + 0.5 * told_s**2 * (sd_s**-2 - wide_s**-2)
+    likely, share = float(expit(odds)), (_USUAL_S / wide_s) ** 2
+    there_s = share * told_s
+    variance = likely * (share * sd_s**2 + (1.0 - likely) * there_s**2)
+    return likely * there_s, math.sqrt(variance)
 
 
 def _agreeing(logs: Sequence[Lateness]) -> list[Lateness]:

@@ -215,7 +215,7 @@ def phase_fault(found: AxisIdentification) -> str | None:
     """Return why the phase of raw logs cannot be used, by the best fit to them; else None."""
     fit = found.fit
     main = main_mode(fit) if fit else None
-    if fit is None or main is None or fit.magnitude_only or fit.residual > _USELESS:
+    if fit is None or main is None or fit.magnitude_only:
         return None
     if fit.residual > _POOR:
         return (

@@ -144,7 +144,7 @@ def lateness_in(
     Parameters
     ----------
     friction : Friction
-        Because of it, alignment placed the start of the test too late.
+        Because of it, alignment placed the start of the test too late, and is unsure of it.
     response : FrequencyResponse
         Of the nozzle over the bed.
     plant, plants : PlantSpec, PlantSetSpec
@@ -153,4 +153,5 @@ def lateness_in(
     members = plants.members
     others = () if isinstance(members, ParametricMembers) else [m.plant for m in members]
     started_s = run.aligned.start_s - friction.late_s
-    return lateness(run.log, run.aligned.excitation, started_s, response, plant, others)
+    test, held_mm = run.aligned.excitation, friction.held_mm
+    return lateness(run.log, test, started_s, response, plant, others, held_mm)

@@ -28,7 +28,8 @@ __all__ = [
 
 _LOWEST_HZ = {"zv": 21.0, "mzv": 23.0, "ei": 29.0, "2hump_ei": 39.0, "3hump_ei": 48.0}
 _HIGHEST_HZ = 200.0
-_STEP_HZ = 0.2
+_HIGHEST_SHAPER_HZ, _STEP_HZ = 150.0, 0.2
+"""Klipper tries no shaper at 150 Hz or above (MAX_SHAPER_FREQ, since 2020-10)."""
 _DAMPING = 0.1
 _TESTED_DAMPING = (0.075, 0.1, 0.15)
 _REDUCTION = 20.0
@@ -131,7 +132,7 @@ def residual_vibration(pulses: Pulses, f_hz: ArrayLike, zeta: float) -> Array:
 
 def _tried(name: str, f: Array, weighted: Array) -> list[ShaperChoice]:
     """Score a shaper at every frequency of Klipper's grid, the highest first."""
-    grid = np.arange(_LOWEST_HZ[name], _HIGHEST_HZ, _STEP_HZ)[::-1]
+    grid = np.arange(_LOWEST_HZ[name], _HIGHEST_SHAPER_HZ, _STEP_HZ)[::-1]
     unit = shaper_pulses(name, 1.0, _DAMPING)
     ignored = weighted.max(axis=1, keepdims=True) / _REDUCTION
     total = np.maximum(weighted - ignored, 0).sum(1)

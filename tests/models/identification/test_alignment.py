@@ -209,6 +209,13 @@ def test_pulses_as_strong_as_assumed_stay_so() -> None:
     np.testing.assert_array_equal(shown.command_mm_s2, stated.command_mm_s2)
 
 
+def test_what_hides_the_slow_sweep_does_not_tell_another_strength() -> None:
+    """Noise as strong as the friction of a heavy axis whose frame shakes: it told 65."""
+    log = log_of(SHORT, sensor=replace(ADXL345, noise_mm_s2=4000.0))
+    shown = align(log, SHORT, is_strength_known=False)
+    assert shown.excitation == SHORT
+
+
 def test_wrong_logs_have_their_own_messages() -> None:
     good = log_of()
     rng = np.random.default_rng(13)

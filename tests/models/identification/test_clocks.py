@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stillpath.models.identification.clocks import Lateness, timed
+from stillpath.models.identification.clocks import Lateness, lateness, timed
 from stillpath.models.identification.identify import Measured, identify
 from stillpath.models.identification.prompt import delay_of, delayed
 from stillpath.models.identification.readers import ReadSettings
@@ -18,6 +18,7 @@ from stillpath.models.identification.types import (
     Axis,
     AxisIdentification,
     Excitation,
+    FrequencyResponse,
 )
 from stillpath.models.plants import (
     PairsSpec,
@@ -94,6 +95,10 @@ def in_bands(*late_ms: float, whole: bool = True, interval_ms: float = 1e-3) -> 
 
 
 BOTH = of_both(x=FREE, y=FREE)
+F_HZ = np.arange(6.0, 98.0, 0.5)
+RESPONSE = FrequencyResponse(
+    F_HZ, frequency_response(GUIDED, F_HZ), np.full(len(F_HZ), 0.01), np.ones(len(F_HZ))
+)
 ON_TIME = in_bands(0.3, 0.3, 0.3, 0.3)
 
 
@@ -125,9 +130,20 @@ ON_TIME = in_bands(0.3, 0.3, 0.3, 0.3)
         ([ON_TIME, in_bands(*4 * [83.0])], [in_bands(0.5, 0.5, 0.5, 0.5)], {}),
         # Slow sensors leave more to what is usual, and two kinds of them tell nothing.
         (
-            [in_bands(0.3, 0.3, 0.3, 0.3, interval_ms=0.625)],
-            [in_bands(0.5, 0.5, 0.5, 0.5, interval_ms=0.625)],
-            {"y": 0.2 / (1 + 0.625**2 / 6 / 0.25**2)},
+            3 * [in_bands(0.3, 0.3, 0.3, 0.3, interval_ms=0.625)],
+            3 * [in_bands(0.7, 0.7, 0.7, 0.7, interval_ms=0.625)],
+            {"y": 0.26331},
+        ),
+        # By where logs begin alone, an axis may seem late by as much where nothing delays it.
+        (
+            3 * [in_bands(0.3, 0.3, 0.3, 0.3, interval_ms=0.3125)],
+            3 * [in_bands(0.43, 0.43, 0.43, 0.43, interval_ms=0.3125)],
+            {"y": 0.064863},
+        ),
+        (
+            [in_bands(0.3, 0.3, 0.3, 0.3, interval_ms=0.3125)],
+            [in_bands(0.43, 0.43, 0.43, 0.43, interval_ms=0.3125)],
+            {},
         ),
         ([ON_TIME], [in_bands(0.5, 0.5, 0.5, 0.5, interval_ms=2e-3)], {}),
         ([], [ON_TIME], {}),
@@ -144,6 +160,16 @@ def test_what_the_logs_of_both_axes_agree_on(
     }
     assert told_ms == pytest.approx(expected_ms, rel=1e-4)
     assert [axis for axis, one in found.items() if one.notes] == list(expected_ms)
+
+
+@pytest.mark.parametrize(("friction_um", "is_told"), [(0.0, True), (3.0, True), (40.0, False)])
+def test_friction_makes_lateness_unsure(friction_um: float, is_told: bool) -> None:
+    """It delays by up to 5 ms itself, and its own law is hardly known."""
+    unsure_s = lateness(
+        logged("y", 0), TEST, 0.0, RESPONSE, GUIDED, friction_mm=1e-3 * friction_um
+    ).unsure_s
+    found = timed(BOTH, {"x": [ON_TIME], "y": [replace(in_bands(*4 * [0.5]), unsure_s=unsure_s)]})
+    assert bool(found["y"].notes) is is_told
 
 
 def late_by_plant(*late_ms: float | None) -> Lateness:

@@ -56,6 +56,14 @@ def test_one_mode_is_met_by_mzv() -> None:
     assert every[0].smoothing_mm < best.smoothing_mm
 
 
+def test_no_shaper_above_150_hz() -> None:
+    """What Klipper's own shaper_calibrate.py (2026-08) says of this spectrum."""
+    f_hz, psd = F[F >= 5.0], one_mode(170.0, 0.05)[F >= 5.0]
+    best, every = choose_shaper(f_hz, psd)
+    assert (best.name, round(best.f_hz, 1)) == ("ei", 149.8)
+    assert [round(one.f_hz, 1) for one in every] == [149.8, 105.8, 149.8, 149.8, 149.8]
+
+
 @pytest.mark.parametrize(("f_hz", "accel"), [(30, 2700), (40, 4700), (50, 7400), (60, 10600)])
 def test_suggested_acceleration(f_hz: float, accel: float) -> None:
     """Figures that Klipper's code prints for mzv, rounded to 100 mm/s^2."""
