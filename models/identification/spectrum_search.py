@@ -27,12 +27,13 @@ __all__ = ["Candidate", "Search", "whitening_of"]
 _DB = 10 / np.log(10)
 _SEED = 20
 _STARTS, _KEPT_STARTS = 48, 12
-_HOPS, _BASES = 100, 8
+_HOPS, _BASES = 300, 8
 """Starts near one of the best fits found until then, and among how many. Random starts alone miss
-the best fits of tables with modes close to each other."""
+the best fits of tables with modes close to each other, and a hundred hops those with two modes
+above the band (docs/tried.md)."""
 _JUMP = (0.1, 0.5, 0.3)
 """Standard deviations of a hop: of log frequencies, log damping ratios and shares."""
-_NEW_MODE = (1.2, 1.8)
+_NEW_MODE = (1.2, 2.4)
 """A hop puts a mode above the lowest bin and below the highest one, times these factors."""
 _DRAWS = 16
 """Per kind of scatter."""
@@ -47,7 +48,9 @@ power the driven one may have: Z of an ADXL345 hisses twice as much as X and Y (
 _ZETA, _ZETA_SPREAD = 0.08, 0.5
 """Damping where a spectrum does not tell it, and the standard deviation of its logarithm."""
 _SHARE_SPREAD = 0.6
-_ZETA_BAND, _SHARE_BAND = (0.008, 0.4), (-2.0, 2.5)
+_ZETA_BAND, _SHARE_BAND = (0.008, 0.25), (-2.0, 2.5)
+"""A mode with more damping shows no peak, and stands for whatever bends a table below 30 Hz: slow
+motion follows it far (docs/tried.md)."""
 _MODES_BAND = (1.1, 2.4)
 """Modes lie above the lowest bin and below the highest one, times these factors."""
 _BEYOND = 0.6
