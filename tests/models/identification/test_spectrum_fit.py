@@ -29,6 +29,7 @@ from stillpath.models.identification.types import Excitation, Fit, Spectrum
 from stillpath.models.plants import (
     Mode,
     ModesSpec,
+    RelativeModesSpec,
     frequency_response,
 )
 
@@ -283,3 +284,27 @@ def test_no_plant_keeps_a_weak_mode_at_the_edge_of_the_table() -> None:
     assert explaining.frame_hz == pytest.approx(10.5, rel=0.1)
     for plant in explaining.explained().population.members:
         assert min(mode.f_hz for mode in plant.modes) > 12.5
+
+
+def test_a_stiff_axis_is_not_explained_by_modes_without_a_peak() -> None:
+    """A table that is level up to 30 Hz; modes far below would move slow motion eight times as far.
+
+    Its bins are as uneven as those of real tables: by half a decibel, and less at low frequency.
+    """
+    modes, shares = ((58.0, 0.2), (88.0, 0.045), (143.0, 0.04), (300.0, 0.08)), (0.24, 0.03, -0.15)
+    values = zip(modes, (*shares, 1.0 - sum(shares)), strict=True)
+    stiff = RelativeModesSpec.model_validate(
+        {"modes": [{"f_hz": f, "zeta": zeta, "share": share} for (f, zeta), share in values]}
+    )
+    rng = np.random.default_rng(0)
+    plants = {"x": stiff, "y": modal(((50.0, 0.1),), (1.0,))}
+    table = simulate_spectrum(plants, LEGACY, sensor=Sensor(noise_mm_s2=60.0), rng=rng)
+    uneven = np.convolve(rng.standard_normal(len(table.f_hz)), np.full(3, 3**-0.5), "same")
+    uneven_db = 0.5 * uneven * np.clip(table.f_hz / 25.0, 0.15, 1.0)
+    table = replace(table, psd={**table.psd, "x": table.psd["x"] * 10 ** (0.1 * uneven_db)})
+    for plant in explain_spectra([table], LEGACY).population.members:
+        assert compliance_s2(plant) == pytest.approx(compliance_s2(stiff), rel=0.8)
+
+
+def compliance_s2(plant: RelativeModesSpec) -> float:
+    return sum(mode.share / (2 * np.pi * mode.f_hz) ** 2 for mode in plant.modes)
