@@ -171,7 +171,7 @@ def test_with_classic_jerk_fast_moves_start_as_slowly_as_the_one_before(
     assert np.abs(late_s[1:-1] - late_s[1]).max() < 1.3e-3 * first_steps
 
 
-FAST = "G1 X200 Y190 E6 F18000\nG1 X20 Y150 E6\nG1 X190 Y20 E6\nG1 X60 Y200 E6\n"
+FAST = "G1 X200 Y190 E6 F15000\nG1 X20 Y150 E6\nG1 X190 Y20 E6\nG1 X60 Y200 E6\n"
 
 
 def without_room(name: str) -> Machine:

@@ -177,6 +177,9 @@ class MarlinEncoder:
         ways = [
             _Way(self._start_hz, late=False),
             _Way(self._start_hz, late=True),
+            _Way(np.inf, late=True),
+            _Way(np.inf, late=True, earlier=_EARLIER),
+            # Last, as starts after a break ask more of the motors.
             _Way(self._start_hz, late=True, diagonal=True),
             _Way(np.inf, late=True, diagonal=True),
             _Way(np.inf, late=True, diagonal=True, earlier=_EARLIER),
