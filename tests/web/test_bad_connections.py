@@ -127,6 +127,7 @@ def test_the_focus_stays_on_the_pager_at_the_last_page(visitor: Visitor, gear: d
     page = visitor.open("#/", **PHONE)
     page.route("**/v1/jobs?**", answer)
     page.evaluate("location.hash = '#/jobs'")
+    expect(page.get_by_role("button", name="Older")).to_be_visible()
     page.get_by_role("button", name="Older").press("Enter")
     expect(page.get_by_role("button", name="Newer")).to_be_focused()
     page.keyboard.press("Enter")

@@ -35,6 +35,7 @@ export async function show({ main, signal, setTitle }) {
     reload(true);
   } }, "Older");
   const pager = h("nav.pager", { "aria-label": "Pages of jobs" }, newer, older);
+  pager.hidden = true; // until it is known whether there are more
   const fault = h("div");
   const filter = h("div.choices", { role: "group", "aria-label": "Show jobs that are" },
     STATES.map(([value, text]) => h("button", {
