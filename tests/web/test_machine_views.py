@@ -25,7 +25,7 @@ def test_machines_are_listed_and_found(visitor: Visitor, service: Service):
     visitor.shoot(page, "machines")
     page.get_by_role("link", name=re.compile("Voron 2.4")).click()
     expect(page.get_by_role("heading", name="X axis")).to_be_visible()
-    expect(page.get_by_role("region", name="Modes of the X axis")).to_contain_text("65.35 ± 0.65")
+    expect(page.get_by_role("region", name="Modes of the X axis")).to_contain_text("65.29 ± 0.60")
     expect(page.locator(".plot canvas")).to_have_count(2)
     visitor.shoot(page, "machine-builtin")
 
