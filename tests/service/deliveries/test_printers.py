@@ -91,7 +91,7 @@ def test_a_late_upload_replaces_no_later_file(tmp_path: Path):
     with moonraker() as server, at(tmp_path, printer("p", "moonraker", server.url)) as place:
         earlier = place.finish(tmp_path, printer="p", created_at=1000.0)
         later = place.finish(tmp_path, printer="p", created_at=2000.0)
-        until_s = time.time() + 60
+        until_s = time.time() + 600
         claims = [claim(place.engine, now=time.time(), until=until_s) for _ in range(2)]
         of_earlier, of_later = (found[0] for found in claims if found)
         assert settle(place.engine, of_earlier, "waiting", next_at=0.0)
