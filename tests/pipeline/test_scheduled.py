@@ -94,6 +94,25 @@ def test_an_axis_without_a_resonance_beside_one_that_grows_heavier() -> None:
     assert note.startswith("The plant of axis y follows the mass on the bed")
 
 
+def test_a_heavy_print_is_told_where_nothing_follows_it() -> None:
+    corexy = load_machine("generic-corexy")
+    for machine, filament_mm, told in (
+        (bedslinger(None), 60_000.0, True),
+        (bedslinger(None), 40_000.0, False),
+        (bedslinger(100.0), 60_000.0, False),
+        (corexy, 60_000.0, False),
+    ):
+        operation = Operation(machine)
+        lines = "".join(f"G1 X{50 + k % 2} E{filament_mm / 100:g}\n" for k in range(100))
+        for moves in moves_of(f"{HEAD}G1 X20 Y20 Z0.2 F3000\n{lines}", machine):
+            operation.passed(moves)
+        heavy = [note for note in operation.notes() if "weighs" in note]
+        assert bool(heavy) == told
+        if told:
+            assert f"{1e3 * filament_mm * KG_PER_MM:.0f} g" in heavy[0]
+            assert operation.at(moves).mass_kg == 0.0
+
+
 def test_where_a_piece_is() -> None:
     machine = bedslinger()
     (moves,) = moves_of(f"{HEAD}G1 X20 Y20 Z9 F3000\nG1 Z0.3\nG1 X50 E10\nG1 X70 E10\n", machine)
