@@ -238,7 +238,9 @@ def set_firmware(
     file: Annotated[
         Path,
         typer.Argument(
-            metavar="FILE", help="The firmware section as JSON, or what Marlin answers to M503."
+            metavar="FILE",
+            help="Klipper's printer.cfg, what Marlin answers to M503, or the firmware section as "
+            "JSON.",
         ),
     ],
     as_name: Annotated[
@@ -249,13 +251,14 @@ def set_firmware(
 ) -> None:
     """Give a machine another firmware: its next revision, or with --as a copy.
 
-    Of an answer to M503, what it does not say stays as the machine has it.
+    What a printer.cfg or an answer to M503 does not say stays as the machine has it, and so does
+    what was measured.
     """
     from stillpath.applications.machines.transfer import with_firmware_file
 
     resolver = open_machines()
     found = resolver.to_look_at(name)
-    machine, source = with_firmware_file(found.machine, file)
+    machine, sources, notes = with_firmware_file(found.machine, file)
     if as_name is not None:
         machine = machine.model_copy(update={"name": as_name})
     revision = resolver.store.add_revision(
@@ -263,11 +266,11 @@ def set_firmware(
         machine,
         author=who(by),
         message=message or f"firmware from {file.name}",
-        sources=[source],
+        sources=sources,
         expected=found.number if as_name is None else 0,
     )
     print_revision(revision)
-    for line in _refused(machine):
+    for line in [*notes, *_refused(machine)]:
         typer.echo(line)
 
 
@@ -310,6 +313,7 @@ def check(
     """Look whether a machine can still be relied on. Exit code 0 fine, 2 not."""
     from stillpath.applications.machines.checks import (
         check_before_job,
+        differences,
         envelope_warnings,
         not_followed,
         not_planned,
@@ -334,6 +338,8 @@ def check(
         notes += read_as_older(config)
     for line in [*found, *(f"note: {line}" for line in notes)]:
         typer.echo(line)
+    if config is not None and differences(machine, config):
+        typer.echo(f"all of printer.cfg: stillpath machines set-firmware {name} {printer_cfg}")
     if found:
         raise typer.Exit(2)
     typer.echo(f"{name}: no problems found")
@@ -355,13 +361,9 @@ def from_config(
     by: By = None,
 ) -> None:
     """Make a machine from a printer.cfg: limits and travel, with plants still to be measured."""
-    from stillpath.applications.machines.checks import (
-        machine_from_config,
-        not_followed,
-        not_planned,
-        read_as_older,
-    )
+    from stillpath.applications.machines.checks import machine_from_config
     from stillpath.applications.machines.klipper_config import read_printer_config
+    from stillpath.applications.machines.klipper_settings import config_notes
     from stillpath.applications.machines.revision import source_file
 
     config = read_printer_config(file)
@@ -375,8 +377,8 @@ def from_config(
         expected=0,
     )
     print_revision(revision)
-    for line in [*not_followed(config), *read_as_older(config), *not_planned(config)]:
-        typer.echo(f"note: {line}")
+    for line in config_notes(config):
+        typer.echo(line)
 
 
 @app.command("from-m503")

@@ -19,7 +19,7 @@ _LONGEST_RETRACTION_MM = 20.0
 """Filament pulled back further has left the hotend: a change of filament or tool, after which the
 firmware may load by itself. Such a retraction is not offset against later extrusion."""
 _HEAVY_KG = 0.15
-"""From here on a print lowers the resonances of a bed of 0.8 kg by more than 8 %, which is more than
+"""From here on a print lowers the resonances of a bed of 0.8 kg by 8 %, which is more than
 the plants of a set differ by."""
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from stillpath.applications.machines.klipper_config import Fact, PrinterConfig, facts
+from stillpath.applications.machines.klipper_config import PrinterConfig, facts
 from stillpath.models.complaints import explain
 from stillpath.models.errors import ModelError
 from stillpath.models.firmware import Klipper
@@ -22,12 +22,14 @@ __all__ = [
     "StatedMachine",
     "age_warnings",
     "check_before_job",
+    "check_config",
     "derived_envelope",
     "differences",
     "envelope_warnings",
     "machine_from_config",
     "not_followed",
     "not_planned",
+    "put_fact",
     "read_as_older",
     "stated_axis",
     "with_firmware",
@@ -183,8 +185,7 @@ def machine_from_config(config: PrinterConfig, stated: StatedMachine) -> Machine
     ModelError
         If the configuration lacks something, or is of an unknown kind of machine.
     """
-    _check_kinematics(config)
-    _check_shaper(config)
+    check_config(config)
     found = facts(config)
     shaper_hz = {fact.place: fact.value for fact in found}
     document: dict[str, Any] = {
@@ -199,7 +200,7 @@ def machine_from_config(config: PrinterConfig, stated: StatedMachine) -> Machine
         },
     }
     for fact in found:
-        _put(document, fact)
+        put_fact(document, fact.place, fact.value)
     # No facts, so that machines from before these were noted do not differ from their printers.
     whole = not config.includes
     document.setdefault("firmware", {})["macros_known"] = whole
@@ -210,6 +211,12 @@ def machine_from_config(config: PrinterConfig, stated: StatedMachine) -> Machine
         hint = "".join(f"; {line}" for line in not_followed(config))
         raise ModelError(f"{config.name}: {explain(error)}{hint}") from None
     return machine.model_copy(update={"command": derived_envelope(machine)})
+
+
+def check_config(config: PrinterConfig) -> None:
+    """Raise ModelError if a configuration is of a machine that cannot be compensated."""
+    _check_kinematics(config)
+    _check_shaper(config)
 
 
 def _check_kinematics(config: PrinterConfig) -> None:
@@ -414,11 +421,14 @@ def _at(document: Any, place: str) -> Any:
     return document
 
 
-def _put(document: dict[str, Any], fact: Fact) -> None:
-    *parts, last = fact.place.split(".")
+def put_fact(document: dict[str, Any], place: str, value: Any) -> None:
+    """Put a value at its place in a machine document; parts that lack are made."""
+    *parts, last = place.split(".")
     for part in parts:
-        document = document.setdefault(part, {})
-    document[last] = fact.value
+        if document.get(part) is None:
+            document[part] = {}
+        document = document[part]
+    document[last] = value
 
 
 def _same(place: str, stands: Any, value: Any) -> bool:

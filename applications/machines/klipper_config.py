@@ -28,6 +28,7 @@ __all__ = [
     "Option",
     "PrinterConfig",
     "facts",
+    "looks_like_printer_config",
     "parse_printer_config",
     "read_printer_config",
 ]
@@ -47,6 +48,8 @@ _REFERENCE = re.compile(r"(?<!\\)\$\{(?:(?P<section>[^.:${}]+)[.:])?(?P<option>[
 """To another option, as Kalico has them (klippy/configfile.py, 2026-07): ${constants.speed}."""
 _MOST_REFERENCES = 10
 _COMMENT = re.compile(r"#.*$|(?:^|\s);.*$")
+_OWN_SECTION = re.compile(r"^\[(?:printer|extruder|stepper_[xyz]|include\s[^]]+)\]", re.MULTILINE)
+"""Sections that each printer.cfg has, or gets by including others."""
 
 
 class Option(NamedTuple):
@@ -162,6 +165,11 @@ class Fact(NamedTuple):
     place: str
     """Field of the machine document; its first parts may be None there."""
     value: Any
+
+
+def looks_like_printer_config(text: str) -> bool:
+    """Return whether a text is meant as a printer.cfg."""
+    return _OWN_SECTION.search(text) is not None
 
 
 def read_printer_config(path: Path) -> PrinterConfig:

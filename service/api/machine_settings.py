@@ -11,8 +11,8 @@ from starlette.concurrency import run_in_threadpool
 from stillpath.applications.machines import marlin_settings
 from stillpath.applications.machines.checks import StatedMachine, machine_from_config
 from stillpath.applications.machines.klipper_config import parse_printer_config
+from stillpath.applications.machines.klipper_settings import with_config
 from stillpath.applications.machines.revision import source_file
-from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
 from stillpath.service.api.access import Admin
 from stillpath.service.api.machine_views import RevisionView
@@ -74,7 +74,7 @@ class _Given:
     "/{name}/settings",
     response_model=RevisionView,
     responses={
-        200: {"description": "The next revision, with Marlin's values"},
+        200: {"description": "The next revision, with the printer's values"},
         201: {"description": "The first revision of a new machine", "model": RevisionView},
         **responses(403, 409, 412, 413, 422, 428),
     },
@@ -91,8 +91,8 @@ async def put_settings(
 ) -> RevisionView:
     """Create a machine from a printer.cfg or M503's output; its plants are yet to be measured.
 
-    An existing machine is updated from M503's output (with `If-Match`, as for PUT); what is not in
-    it stays.
+    An existing machine is updated from it (with `If-Match`, as for PUT); what is not in it stays,
+    and so do measured plants.
     """
     content = await receive_document(request, max_bytes=_LARGEST_BYTES)
     file = safe_name(given.file)
@@ -101,12 +101,9 @@ async def put_settings(
     def made(before: Machine | None) -> Machine:
         if before is None:
             return _new(text, file, name, given)
-        if not marlin_settings.looks_like_m503(text):
-            raise ModelError(
-                f"{name!r} already exists, and a printer.cfg makes a new machine: give another "
-                "name, or compare the two with `stillpath machines check`"
-            )
-        return marlin_settings.with_m503(before, text, file)
+        if marlin_settings.looks_like_m503(text):
+            return marlin_settings.with_m503(before, text, file)
+        return with_config(before, parse_printer_config(text, file, _WANTED))
 
     def stored() -> RevisionView:
         message = edit.message or _message(text, file)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from stillpath.applications.machines.checks import differences
-from stillpath.applications.machines.klipper_config import PrinterConfig
+from stillpath.applications.machines.klipper_config import PrinterConfig, read_printer_config
 from stillpath.cli.main import run
 from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
@@ -54,6 +54,67 @@ def test_next_revision_of_an_own_machine(capsys) -> None:
     assert out.startswith("mine: revision 2")
     _, out, _ = stillpath(capsys, "machines", "diff", "mine", "1", "2")
     assert "firmware.kind: marlin -> reprapfirmware" in out
+
+
+PRINTER_CFG = (
+    "[printer]\nkinematics: cartesian\nmax_velocity: 300\nmax_accel: 3000\n"
+    + "".join(f"[stepper_{axis}]\nposition_max: 200\n" for axis in "xyz")
+    + "[include macros.cfg]\n[input_shaper]\nshaper_freq_x: 40\n"
+)
+
+
+def test_a_printer_cfg_brings_a_measured_machine_up_to_date(capsys, tmp_path) -> None:
+    """Limits, travel and macros of its files; what was measured and named stays."""
+    config, macros = tmp_path / "printer.cfg", tmp_path / "macros.cfg"
+    config.write_text(PRINTER_CFG)
+    macros.write_text("[gcode_macro M204]\ngcode:\n  SET_VELOCITY_LIMIT ACCEL={params.S}\n")
+    stillpath(capsys, "machines", "from-config", config, "--name", "mine")
+    measured = read_machine(stillpath(capsys, "machines", "mine")[1])
+    measured = measured.model_copy(
+        update={
+            "axes": load_machine("ender3").axes,
+            "mesh_slope": 0.01,
+            "firmware": measured.firmware.model_copy(update={"stopping_macros": ("WIPE",)}),
+        }
+    )
+    document = tmp_path / "mine.json"
+    document.write_text(measured.model_dump_json())
+    stillpath(capsys, "machines", "put", document)
+
+    config.write_text(PRINTER_CFG.replace("3000", "4000") + "[danger_options]\n")
+    _, out, _ = stillpath(capsys, "machines", "check", "mine", "--printer-cfg", config)
+    assert f"machines set-firmware mine {config}" in out
+    code, out, err = stillpath(capsys, "machines", "set-firmware", "mine", config)
+    assert (code, err) == (0, "")
+    assert out.startswith("mine: revision 3")
+    now = read_machine(stillpath(capsys, "machines", "mine")[1])
+    assert (now.axes, now.mesh_slope) == (measured.axes, 0.01)
+    assert now.firmware.planner.max_accel_mm_s2 == 4000.0
+    assert now.firmware.stopping_macros == ("WIPE", "SET_PRESSURE_ADVANCE")
+    assert now.command.accel_mm_s2 == pytest.approx(4 / 3 * measured.command.accel_mm_s2)
+    _, out, _ = stillpath(capsys, "machines", "check", "mine", "--printer-cfg", config)
+    assert "printer.cfg" not in out
+
+    config.write_text(PRINTER_CFG.replace("cartesian", "corexy"))
+    code, _, err = stillpath(capsys, "machines", "set-firmware", "mine", config)
+    assert code == 2
+    assert "was measured as cartesian" in err
+    macros.unlink()
+    config.write_text(PRINTER_CFG)
+    _, out, _ = stillpath(capsys, "machines", "set-firmware", "mine", config)
+    assert "[include macros.cfg]" in out
+    assert not read_machine(stillpath(capsys, "machines", "mine")[1]).firmware.macros_known
+
+
+def test_a_machine_keeps_its_plants_where_klipper_replaces_marlin(capsys, tmp_path) -> None:
+    marlin, config = EXAMPLES / "marlin.json", tmp_path / "printer.cfg"
+    config.write_text(PRINTER_CFG.replace("[include macros.cfg]\n", ""))
+    stillpath(capsys, "machines", "set-firmware", "ender3", marlin, "--as", "mine")
+    code, _, _ = stillpath(capsys, "machines", "set-firmware", "mine", config)
+    now = read_machine(stillpath(capsys, "machines", "mine")[1])
+    assert (code, now.firmware.kind) == (0, "klipper")
+    assert now.axes == load_machine("ender3").axes
+    assert differences(now, read_printer_config(config)) == []
 
 
 def test_what_the_motors_bear_is_derived_anew_where_it_was_derived(capsys, tmp_path) -> None:
@@ -120,7 +181,7 @@ def test_a_firmware_that_executes_no_stream_is_told_at_once(capsys, tmp_path) ->
 @pytest.mark.parametrize(
     ("section", "message"),
     [
-        ("{", "at line 1 column 1); a firmware section as JSON is needed, or an answer to M503"),
+        ("{", "at line 1 column 1); a firmware section as JSON is needed, an answer to M503"),
         ('{"kind": "klipper", "kind": "marlin"}', "'kind' is there twice; keep one of them"),
         ("[]", "says its kind"),
         ('{"planner": {}}', "says its kind"),

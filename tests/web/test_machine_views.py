@@ -163,3 +163,24 @@ def test_a_machine_is_made_of_what_marlin_answers(visitor: Visitor, tmp_path: Pa
     page.get_by_role("button", name="Keep as the next revision").click()
     expect(page.get_by_role("button", name="Show differences")).to_be_visible()
     visitor.shoot(page, "machine-of-m503")
+
+
+def test_a_machine_is_brought_up_to_date_by_its_printer_cfg(visitor: Visitor, tmp_path: Path):
+    file = tmp_path / "printer.cfg"
+    config = (
+        "[printer]\nkinematics: cartesian\nmax_velocity: 300\nmax_accel: 3000\n"
+        + "".join(f"[stepper_{axis}]\nposition_max: 200\n" for axis in "xyz")
+    )
+    file.write_text(config)
+    page = visitor.open("#/machines", viewport={"width": 390, "height": 844})
+    form = page.locator("form", has=page.locator("#settings-name"))
+    form.locator("input[type=file]").set_input_files(file)
+    form.get_by_label("Name of your machine").fill("of-config")
+    page.get_by_role("button", name="Make the machine").click()
+    expect(page.get_by_role("heading", name="of-config")).to_be_visible()
+    file.write_text(config.replace("3000", "5000"))
+    again = page.locator("form", has_text="Choose printer.cfg")
+    again.locator("input[type=file]").set_input_files(file)
+    page.get_by_role("button", name="Keep as the next revision").click()
+    expect(page.get_by_role("button", name="Show differences")).to_be_visible()
+    visitor.shoot(page, "machine-of-config")

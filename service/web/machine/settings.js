@@ -11,12 +11,15 @@ const ENDS = "\\s*(-?[0-9.]+\\s*:\\s*)?[0-9.]+\\s*";
 const TRAVEL = `${ENDS}[xX]${ENDS}[xX]${ENDS}`;
 const M503 = /^.*\bM(92|201|203|204|205)\s+[A-Z]/m;
 
+/** What the printers of a firmware say of themselves. @type {Record<string, string>} */
+export const SETTINGS = { klipper: "printer.cfg", marlin: "Marlin's answer to M503" };
+
 /**
- * @param {{machine: {name: string, revision: string} | null, signal: AbortSignal}} about `machine`:
- *   the one that gets Marlin's values, or null for a new one.
+ * @param {{machine: {name: string, revision: string} | null, firmware?: string, signal: AbortSignal}} about
+ *   `machine`: the one that gets the values, with its firmware, or null for a new one.
  * @returns {HTMLElement}
  */
-export function settingsPanel({ machine, signal }) {
+export function settingsPanel({ machine, firmware = "", signal }) {
   let text = "";
   let file = "";
   const status = h("div", { "aria-live": "polite" });
@@ -35,7 +38,7 @@ export function settingsPanel({ machine, signal }) {
     send();
   } },
     dropZone(machine
-      ? { label: "Choose Marlin's answer to M503, or drop it here", hint: "What it does not say stays as it is", accept: ".txt,.log,.gcode,text/*", onChoose }
+      ? { label: `Choose ${SETTINGS[firmware]}, or drop it here`, hint: "What it does not say stays as it is, and so does what was measured", accept: ".cfg,.txt,.log,.gcode,text/*", onChoose }
       : { label: "Choose printer.cfg or Marlin's answer to M503, or drop it here", hint: "Klipper: printer.cfg. Marlin: send M503 from a host, and save all of the answer as a text file", accept: ".cfg,.txt,.log,text/*", onChoose }),
     machine ? null : [
       h("div.fields", null,

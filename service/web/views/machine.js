@@ -10,7 +10,7 @@ import { filterButton } from "../job/ways.js";
 import { measurementPanel } from "../machine/measurement.js";
 import { identifiedPlots, responsePlots } from "../machine/plots.js";
 import { revisionPanel } from "../machine/revisions.js";
-import { settingsPanel } from "../machine/settings.js";
+import { SETTINGS, settingsPanel } from "../machine/settings.js";
 
 /** @param {import("../lib/router.js").Place} place */
 export async function show({ main, signal, setTitle, params: [name] }) {
@@ -29,7 +29,7 @@ export async function show({ main, signal, setTitle, params: [name] }) {
     isOwn ? h("section", null, h("h2", null, "Revisions"), history) : null,
     h("section", null, h("h2", null, isOwn ? "New measurement" : "Measure yours"),
       measurementPanel({ machines, base: machine.name, own: isOwn, signal })),
-    isOwn && machine.firmware.kind === "marlin" ? h("section", null, h("h2", null, "New settings"), settingsPanel({ machine: summary, signal })) : null,
+    isOwn && machine.firmware.kind in SETTINGS ? h("section", null, h("h2", null, "New settings"), settingsPanel({ machine: summary, firmware: machine.firmware.kind, signal })) : null,
     h("section", null, h("h2", null, "Live printing"), summary.live_refusal
       ? h("p", null, `It cannot print live: ${summary.live_refusal}.`)
       : [h("p", null, "The extra inside Klipper compensates with this filter while the printer prints files as sliced."), filterButton(machine.name)]),
