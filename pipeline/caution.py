@@ -10,7 +10,7 @@ error ratio of the worst member is stored with the choice.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
@@ -22,7 +22,6 @@ from stillpath.compensation.base import DesignError
 from stillpath.compensation.cautious import Caution
 from stillpath.compensation.defaults import DEFAULT_BASIS
 from stillpath.compensation.fbf import PreviewFbf
-from stillpath.compensation.friction import against_friction
 from stillpath.compensation.shapers import ShaperCompensator
 from stillpath.models.arrays import Array
 from stillpath.models.machine import CommandLimits, Machine
@@ -30,15 +29,12 @@ from stillpath.models.plants import DiscretePlant, PlantSetSpec, plant_set
 from stillpath.models.reference_motion import reference_motion_of
 from stillpath.models.typed_in import stated_hz
 from stillpath.pipeline.error_range import (
-    ErrorRange,
-    error_ranges,
     phase_unseen,
     side_by_side,
 )
 from stillpath.pipeline.files import kept
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.pipeline.options import Options
-from stillpath.pipeline.result import Channel
 from stillpath.simulation.measures import PathDistances
 from stillpath.simulation.response import response
 
@@ -60,7 +56,7 @@ Pair: TypeAlias = tuple[DiscretePlant, DiscretePlant]
 Shares: TypeAlias = tuple[float, float]
 """Share of a command in its mixture with the shaper's, for X and Y."""
 
-_VERSION = 15
+_VERSION = 16
 _SHARES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.2, 0.0)
 _UNSEEN_SHARE = 0.85
 """Largest share where the phase was not measured: a set cannot warn of what it does not contain."""
@@ -89,8 +85,6 @@ class Mixture:
         Largest ratio to the contour error without compensation.
     rms_um : float
         Contour error, weighted geometric mean over the members.
-    ranges : dict of str to ErrorRange
-        By channel of a report.
     """
 
     shares: Shares
@@ -98,7 +92,6 @@ class Mixture:
     mean: float
     worst_to_none: float
     rms_um: float
-    ranges: dict[str, ErrorRange] = field(default_factory=dict)
 
     @property
     def fit_share(self) -> float:
@@ -109,33 +102,6 @@ class Mixture:
         if not any(self.shares):
             return _LEAST_FIT
         return float(np.clip(self.rms_um / _COARSE_UM, _LEAST_FIT, 1.0))
-
-    def ranged(
-        self, channels: Sequence[Channel], *, command_share: float = 1.0, share: float = 1.0
-    ) -> list[Channel]:
-        """Return the channels of a report with the range over the members.
-
-        Parameters
-        ----------
-        command_share : float
-            Least share of the figures that is the error of the commands themselves; the rest may be
-            that of motor steps or segments.
-        share : float
-            Share of the extruding time that is compensated; the rest moves as sliced.
-        """
-        before_um = next(c.judged_rms_um for c in channels if c.name == "before")
-        reference = self.ranges.get("before")
-        harder = before_um / max(reference.reference_um, 1e-9) if reference else 1.0
-        updated = []
-        for channel in channels:
-            known = self.ranges.get(channel.name)
-            if known is not None:
-                if channel.name == "after" and reference is not None:
-                    left = (1.0 - share) * (before_um / max(channel.judged_rms_um, 1e-9)) ** 2
-                    known = known.mixed(reference, min(left, 1.0) if share else 1.0)
-                channel = known.applied_to(channel, harder, command_share=command_share)
-            updated.append(channel)
-        return updated
 
 
 def measured_set(axis: PlantSetSpec) -> bool:
@@ -214,8 +180,7 @@ def choose_caution(
 
 
 def _read(document: dict[str, Any]) -> Mixture:
-    ranges = {name: ErrorRange(**known) for name, known in document["ranges"].items()}
-    return Mixture(**{**document, "shares": tuple(document["shares"]), "ranges": ranges})
+    return Mixture(**{**document, "shares": tuple(document["shares"])})
 
 
 class Mixtures:
@@ -304,18 +269,7 @@ def _chosen_by_trial(
             1e3 * mixtures.mean(ours_mm),
         )
 
-    best = choice(best_shares(lambda shares: _rank(choice(shares)), most_shares))
-    a = np.array(best.shares)[:, None]
-    mixed = a * exact + (1.0 - a) * smooth
-    channels = {
-        "before": path,
-        "after": against_friction(mixed, machine.friction_mm, _NO_RESTS, dt_s),
-        "shaper": smooth,
-    }
-    return replace(
-        best,
-        ranges=error_ranges(machine, channels, mixtures.rms_mm, dt_s),
-    )
+    return choice(best_shares(lambda shares: _rank(choice(shares)), most_shares))
 
 
 def _commands(

@@ -7,8 +7,8 @@ against the other. Dry friction, which resonance tables cannot show at all, is s
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import astuple, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
@@ -40,8 +40,6 @@ _FRICTION_UNSURE, _WHEELS_UNSURE = 0.35, 1.0
 that far, up to half of it is not found."""
 _FRICTION_UNSEEN_MM_S2 = 1500.0
 """Dry friction over moving mass that tables may hide: .4 N on .25 kg of rails, 1.5 N on a bed."""
-_STEPS_UNSURE = 0.2
-"""Relative spread over the members of the error of motor steps and segments: a guess."""
 _LAG_UNSURE_S = 1.5e-4
 """Unknown delay of X against Y: alignment sets both to 0, but viscous guides may delay one; clocks
 of logs tell some of it (`models.identification.clocks`)."""
@@ -49,7 +47,7 @@ of logs tell some of it (`models.identification.clocks`)."""
 
 @dataclass(frozen=True, slots=True)
 class ErrorRange:
-    """Contour errors with one command on the reference motion, over all that may be true.
+    """Contour errors with one command on some motion, over all that may be true.
 
     Attributes
     ----------
@@ -69,46 +67,22 @@ class ErrorRange:
     friction_um: float = 0.0
     unsure_um: float = 0.0
 
-    def around_um(
-        self, predicted_um: float, harder: float = 1.0, *, command_share: float = 1.0
-    ) -> tuple[float, float]:
+    def around_um(self, predicted_um: float) -> tuple[float, float]:
         """Return the range around the prediction for a print, without unseen friction.
 
-        The error of a command differs between members; what whole motor steps or a coarse fit of
-        segments add to it hardly does. What friction adds depends on where a path turns and hardly
-        on its speed: it is added as it was found on the reference motion.
+        What friction adds depends on where a path turns and hardly on its speed: it is added as it
+        was found on the motion that was tried.
 
         Parameters
         ----------
         predicted_um : float
             Contour error of the nominal plants on the print, rms.
-        harder : float
-            Ratio of the uncompensated error of the print to that on the reference motion.
-        command_share : float
-            Least share of the prediction that is the command's own error; the rest may be that of
-            motor steps or segments.
         """
-        own_um = min(max(command_share * predicted_um, harder * self.reference_um), predicted_um)
-        rounded_um = math.sqrt(predicted_um**2 - own_um**2)
-        return (
-            math.hypot(self.low * own_um, (1.0 - _STEPS_UNSURE) * rounded_um),
-            math.hypot(self.high * own_um, (1.0 + _STEPS_UNSURE) * rounded_um, self.unsure_um),
-        )
+        return self.low * predicted_um, math.hypot(self.high * predicted_um, self.unsure_um)
 
-    def mixed(self, other: ErrorRange, part: float) -> ErrorRange:
-        """Return the range where this part of the squared error is left by another command."""
-        return ErrorRange(
-            *(
-                math.sqrt((1.0 - part) * own**2 + part * its**2)
-                for own, its in zip(astuple(self), astuple(other), strict=True)
-            )
-        )
-
-    def applied_to(
-        self, channel: Channel, harder: float = 1.0, *, command_share: float = 1.0
-    ) -> Channel:
+    def applied_to(self, channel: Channel) -> Channel:
         """Return a channel with its range, and with how far friction may exceed it."""
-        low_um, high_um = self.around_um(channel.judged_rms_um, harder, command_share=command_share)
+        low_um, high_um = self.around_um(channel.judged_rms_um)
         rubbing_um = math.hypot(high_um, self.friction_um) if self.friction_um else None
         ranges = {
             "contour_range_um": (low_um, high_um),
@@ -135,15 +109,19 @@ def nominal_response(machine: Machine, command: Array, dt_s: float) -> Array:
 
 
 def error_ranges(
-    machine: Machine, commands: dict[str, Array], rms: Callable[[Array], float], dt_s: float
+    machine: Machine,
+    commands: Mapping[str, Sequence[Array]],
+    rms: Callable[[Sequence[Array]], float],
+    dt_s: float,
 ) -> dict[str, ErrorRange]:
-    """Return the ranges of the errors of commands on the reference motion, by name.
+    """Return the ranges of the errors of commands, by name.
 
     Parameters
     ----------
-    commands : dict of str to ndarray, shape (2, n)
+    commands : mapping of str to sequence of ndarray, shape (2, n)
+        Stretches of motion, each from a standstill.
     rms : callable
-        Maps positions (2, n) to their rms error.
+        Maps the positions of the stretches, (2, n) each, to their rms error.
     """
     x, y = (plant_set(machine.axes[axis], dt_s) for axis in ("x", "y"))
     pairs = side_by_side(x.members, y.members)
@@ -157,18 +135,20 @@ def error_ranges(
     wheels = np.minimum(known_mm / BEND_MM, 1.0) * (_WHEELS_UNSURE - _FRICTION_UNSURE)
     more_mm = known_mm + np.where(assumed, unsure_mm, (_FRICTION_UNSURE + wheels) * known_mm)
 
-    def range_of(command: Array) -> ErrorRange:
-        def rubbed(held_mm: Array, *, creeps: bool = True) -> float:
-            guides = DryFriction(held_mm.tolist(), dt_s if creeps else 0.0)
-            received = guides.received_mm(command)
-            return rms(response((x.nominal, y.nominal), received))
+    def range_of(stretches: Sequence[Array]) -> ErrorRange:
+        def received_mm(held_mm: Array, *, creeps: bool = True) -> list[Array]:
+            step_s = dt_s if creeps else 0.0
+            return [DryFriction(held_mm.tolist(), step_s).received_mm(one) for one in stretches]
 
-        received = DryFriction(known_mm.tolist(), dt_s).received_mm(command)
-        error = max(rms(response((x.nominal, y.nominal), received)), 1e-12)
-        errors = [
-            rms(_delayed(response(pair, received), lag))
-            for pair, lag in zip(pairs, lags, strict=True)
-        ]
+        def answered(pair: Pair, received: Sequence[Array], lag: float = 0.0) -> float:
+            return rms([_delayed(response(pair, one), lag) for one in received])
+
+        def rubbed(held_mm: Array, *, creeps: bool = True) -> float:
+            return answered((x.nominal, y.nominal), received_mm(held_mm, creeps=creeps))
+
+        received = received_mm(known_mm)
+        error = max(answered((x.nominal, y.nominal), received), 1e-12)
+        errors = [answered(pair, received, lag) for pair, lag in zip(pairs, lags, strict=True)]
         less, more = rubbed(known_mm - unsure_mm), rubbed(more_mm)
         bent = rubbed(known_mm, creeps=False)
         return ErrorRange(
@@ -189,6 +169,8 @@ def _added(error: float, rubbed: float) -> float:
 
 def _delayed(y: Array, samples: float) -> Array:
     """Return a motion (2, n) with X delayed by `samples`; if negative, Y is delayed instead."""
+    if samples == 0.0:
+        return y
     row = 0 if samples > 0.0 else 1
     delayed = y.copy()
     at = np.arange(y.shape[1], dtype=float)

@@ -188,7 +188,7 @@ class _Trial:
         command = self._command(best.taps)
         mixtures = self._mixtures
         ratio = mixtures.errors_mm(mixtures.answers(command)) / mixtures.shaped_mm
-        channels = {"before": self._path, "live": command, "shaper": self._smooth}
+        channels = {"before": [self._path], "live": [command], "shaper": [self._smooth]}
         return LiveDesign(
             best.taps,
             best.shares,
@@ -196,7 +196,7 @@ class _Trial:
             self._shaper,
             float(ratio.max()),
             mixtures.mean(ratio),
-            error_ranges(self._machine, channels, mixtures.rms_mm, DT_S),
+            error_ranges(self._machine, channels, lambda one: mixtures.rms_mm(one[0]), DT_S),
             _peak(command),
         )
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.firmware.writing import StreamWriter
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.slicers.facts import SlicerFacts
@@ -17,7 +16,7 @@ from stillpath.pipeline.clock import StageClock
 from stillpath.pipeline.measuring.measure import Measurement
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.pipeline.operating_point import Operation
-from stillpath.pipeline.options import COARSE_UM, Options
+from stillpath.pipeline.options import Options
 from stillpath.pipeline.pacing.budget import SpeedBudget
 from stillpath.pipeline.pacing.budget_measure import BudgetMeasurement
 from stillpath.pipeline.reading import passed_over, perhaps_passed_over
@@ -102,12 +101,8 @@ class Summary:
                 c.model_copy(update={"selected_rms_um": rms_um.get(c.name)}) for c in channels
             ]
         if self.choice is not None:
-            steps = any(adapter(self.machine).step_mm[:2])
-            channels = self.choice.ranged(
-                channels,
-                command_share=0.0 if steps else min(1.0, COARSE_UM / self.options.tolerance_um),
-                share=self.totals.compensated_share,
-            )
+            ranges = self.measurement.sample.ranges(self.machine, self.shaper)
+            channels = [ranges[c.name].applied_to(c) if c.name in ranges else c for c in channels]
         return channels
 
     def _warnings(self, channels: list[Channel], facts: SlicerFacts) -> Iterator[str]:

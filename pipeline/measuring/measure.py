@@ -26,6 +26,7 @@ from stillpath.pipeline.measuring.maxima import RINGING_S, Maxima
 from stillpath.pipeline.measuring.points import MeasuredPoints, MotionSamples
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.pipeline.measuring.responses import Responses, ResponseSamples
+from stillpath.pipeline.measuring.sample import MotionSample
 from stillpath.pipeline.measuring.spectra import ErrorSpectra
 from stillpath.pipeline.measuring.tracing import Trace, Tracer
 from stillpath.pipeline.result import (
@@ -71,6 +72,11 @@ class Measurement:
         Receives the motion. Errors are then measured at every sample.
     size : int, optional
         Size of the file [bytes].
+
+    Attributes
+    ----------
+    sample : MotionSample
+        Some of the motion, for the range of its errors.
     """
 
     def __init__(
@@ -110,6 +116,7 @@ class Measurement:
         self._waiting: list[MeasuredPoints] = []
         self._jumped = True
         self._last: MotionSamples | None = None
+        self.sample = MotionSample(dt_s)
 
     def operate_at(self, point: OperatingPoint) -> None:
         """Set the operating point of the motion that follows."""
@@ -119,6 +126,7 @@ class Measurement:
         """Add motion."""
         if len(samples):
             self._last = samples
+            self.sample.add(samples)
             which = slice(-self._count % self._stride, None, self._stride)
             points = MeasuredPoints.of(samples, which, jumped=self._jumped)
             if len(points):

@@ -118,7 +118,9 @@ def test_the_error_of_a_printer_that_rubs_is_within_the_range(f_hz: dict[str, fl
     """
     machine, motion = machine_of(f_hz), Motion()
     command = motion.shaped(machine, f_hz)
-    known = error_ranges(machine, {"shaper": command}, motion.rms_mm, DT_S)["shaper"]
+    known = error_ranges(machine, {"shaper": [command]}, lambda one: motion.rms_mm(one[0]), DT_S)[
+        "shaper"
+    ]
     most_um = np.hypot(known.high * known.reference_um, known.friction_um)
     smooth_um, rubbing_um = (
         1e3 * motion.rms_mm(printed(printer(f_hz, force), command)) for force in (0.0, 1.2)
@@ -143,7 +145,9 @@ def test_friction_that_was_found_too_small_counts_in_a_gentle_print_too(
         against_friction(motion.shaped(machine, f_hz), machine.friction_mm, NO_RESTS, DT_S)
         for motion in (hard, gentle)
     ]
-    known = error_ranges(machine, {"after": commands[0]}, hard.rms_mm, DT_S)["after"]
+    known = error_ranges(machine, {"after": [commands[0]]}, lambda one: hard.rms_mm(one[0]), DT_S)[
+        "after"
+    ]
     predicted_um = 1e3 * gentle.rms_mm(nominal_response(machine, commands[1], DT_S))
     low_um, high_um = known.around_um(predicted_um)
     true_um = 1e3 * gentle.rms_mm(printed(printer(f_hz, rubs), commands[1]))

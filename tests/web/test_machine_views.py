@@ -167,9 +167,8 @@ def test_a_machine_is_made_of_what_marlin_answers(visitor: Visitor, tmp_path: Pa
 
 def test_a_machine_is_brought_up_to_date_by_its_printer_cfg(visitor: Visitor, tmp_path: Path):
     file = tmp_path / "printer.cfg"
-    config = (
-        "[printer]\nkinematics: cartesian\nmax_velocity: 300\nmax_accel: 3000\n"
-        + "".join(f"[stepper_{axis}]\nposition_max: 200\n" for axis in "xyz")
+    config = "[printer]\nkinematics: cartesian\nmax_velocity: 300\nmax_accel: 3000\n" + "".join(
+        f"[stepper_{axis}]\nposition_max: 200\n" for axis in "xyz"
     )
     file.write_text(config)
     page = visitor.open("#/machines", viewport={"width": 390, "height": 844})
