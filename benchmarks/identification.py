@@ -32,7 +32,7 @@ from readback import (
 
 from stillpath.applications.identification.run import InputFile, identify_files
 from stillpath.models.identification.identify import Measured, identify
-from stillpath.models.identification.readers import ReadSettings, excitation_for, read_measurements
+from stillpath.models.identification.readers import ReadSettings, assumed_test, read_measurements
 from stillpath.models.identification.shaper_choice import choose_shaper_of
 from stillpath.models.identification.spectrum_fit import explanations
 from stillpath.models.identification.synthetic import (
@@ -160,7 +160,7 @@ def real_tables(folder: Path) -> Iterator[str]:
     for path in files:
         (spectrum,) = read_measurements(path)
         assert isinstance(spectrum, Spectrum)
-        fit = explanations([spectrum], excitation_for(spectrum)).explained().fit
+        fit = explanations([spectrum], assumed_test(spectrum).excitation).explained().fit
         plant = continuous(fit.spec)
         dc = abs(float(np.real(plant.frequency_response(0.0)[0])) - 1)
         if plant.poles().real.max() >= 0 or dc > 1e-9 or fit.residual > 2.6 or fit.order > 4:

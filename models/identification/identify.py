@@ -52,9 +52,8 @@ from stillpath.models.identification.raw_logs import (
 )
 from stillpath.models.identification.readers import (
     ReadSettings,
+    assumed_test,
     date_in_name,
-    excitation_for,
-    excitation_notes,
     tested_axis,
 )
 from stillpath.models.identification.sets import (
@@ -407,7 +406,8 @@ class _AxisWork:
         spectrum = one.measurement
         assert isinstance(spectrum, Spectrum)
         self._steps.stepped(f"axis {self._axis}: {spectrum.source}")
-        return SpectrumRun(spectrum, excitation_for(spectrum, self._settings), one.condition)
+        test = assumed_test(spectrum, self._settings)
+        return SpectrumRun(spectrum, test.excitation, one.condition, test.notes)
 
     def _explain(self, runs: Sequence[SpectrumRun]) -> _Explained:
         """Find what explains the spectra without a condition of their own."""
@@ -426,11 +426,7 @@ class _AxisWork:
     def _from_spectra(self, explained: _Explained, frame_likely: float) -> AxisIdentification:
         runs, common = explained.runs, explained.common
         settings, column = self._settings, self._settings.sensor_axis
-        notes = [
-            (run.spectrum.source, note)
-            for run in runs
-            for note in excitation_notes(run.spectrum, settings)
-        ]
+        notes = [(run.spectrum.source, note) for run in runs for note in run.notes]
         if not column:
             spectra = [run.spectrum for run in runs]
             notes += table_mounting_notes(self._axis, spectra, turned=settings.sensor_turned)
@@ -458,7 +454,7 @@ class _AxisWork:
     ) -> AxisIdentification:
         """Return the axis from spectra of its logs, whose phase no model explains."""
         column = self._settings.sensor_axis or self._axis
-        spectra = [spectrum_in(run, self._settings, column) for run in logs]
+        spectra = [spectrum_in(run, column) for run in logs]
         spectra, left_out = of_one_test(spectra, self._axis)
         found = self._from_spectra(self._explain(spectra), frame_likely)
         read = [note for run in logs for note in run.log.notes]
