@@ -74,7 +74,7 @@ from stillpath.pipeline.verifying import Verifier
 if TYPE_CHECKING:
     from _typeshed import SupportsWrite
 
-__all__ = ["COMPENSATED", "Attempt", "PipelineRun"]
+__all__ = ["COMPENSATED", "PieceAttempt", "PipelineRun"]
 
 _EXPLAINED = (Unfit, GcodeError, DesignError, ModelError)
 """Errors whose message tells the user why a piece cannot be compensated."""
@@ -87,8 +87,8 @@ COMPENSATED = 0.99
 
 
 @dataclass(frozen=True, slots=True)
-class Attempt:
-    """A piece as it may be written."""
+class PieceAttempt:
+    """A piece as it may be written, its motion as read back, and its gap (n,) from the command."""
 
     made: CompensatedPiece
     executed: Phases
@@ -325,7 +325,7 @@ class PipelineRun:
         self.compensated.append(lines)
         self._accept(piece, attempt, delay_s)
 
-    def _accept(self, piece: Piece, attempt: Attempt, delay_s: float) -> None:
+    def _accept(self, piece: Piece, attempt: PieceAttempt, delay_s: float) -> None:
         """Write and measure a piece as attempted; `delay_s` was the delay before it."""
         self._verbatim_before = None
         self._restarts_written.after([piece])
@@ -359,7 +359,7 @@ class PipelineRun:
         self._sum.time_s += restart_s
         return seconds + restart_s
 
-    def _attempt(self, piece: Piece, paced: Piece) -> Attempt:
+    def _attempt(self, piece: Piece, paced: Piece) -> PieceAttempt:
         """Compensate and write a piece at a pace and read it back; or leave everything as it was.
 
         Parameters
@@ -395,7 +395,7 @@ class PipelineRun:
                 f"line {int(piece.moves.line[0])}: internal error ({type(error).__name__}: "
                 f"{error}); please report it with the file"
             ) from error
-        return Attempt(made, executed, gap_mm, text, motion)
+        return PieceAttempt(made, executed, gap_mm, text, motion)
 
     def _put_back(self, piece: Piece, reason: str) -> None:
         """Write a piece as sliced and undo what was counted for it."""

@@ -100,7 +100,7 @@ def advise_file(
         container = file.container
         # Check before the work starts, too: advice only makes the file larger.
         _check_size(source.name, container.text, options.max_mb)
-        job = _Job(container.text, file.spool, machine, options, cache_dir, progress)
+        job = _AdvisedFile(container.text, file.spool, machine, options, cache_dir, progress)
         result = job.run(source.name, container.facts(), earlier, file.layers)
         _check_size(source.name, file.spool, options.max_mb)
         shutil.copyfileobj(file.spool, file.text, _BLOCK_BYTES)
@@ -118,7 +118,7 @@ def _check_size(name: str, text: BinaryIO, max_mb: float | None) -> None:
         )
 
 
-class _Job:
+class _AdvisedFile:
     """One file being advised."""
 
     def __init__(

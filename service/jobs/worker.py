@@ -18,7 +18,7 @@ import structlog
 from stillpath.pipeline.progress import Progress
 from stillpath.service.database.engine import DatabaseAway, StoreError, open_database
 from stillpath.service.environment import prepare_environment
-from stillpath.service.jobs.attempt import Attempt, Workplace
+from stillpath.service.jobs.attempt import Attempt, WorkerEnvironment
 from stillpath.service.jobs.computations import run_computation
 from stillpath.service.jobs.patience import patiently
 from stillpath.service.jobs.state import JobKind
@@ -59,13 +59,13 @@ def run_job(job_id: str, settings: dict[str, Any] | None, runner: str) -> None:
 
     given = None if settings is None else json.dumps(settings, sort_keys=True)
     own, store, storage = _opened(given)
-    workplace = Workplace(
+    workplace = WorkerEnvironment(
         own, store, storage, Path(worker.local_directory), interrupted=interrupted
     )
     execute(job_id, workplace, pkgutil.resolve_name(runner))
 
 
-def execute(job_id: str, workplace: Workplace, runner: Runner) -> None:
+def execute(job_id: str, workplace: WorkerEnvironment, runner: Runner) -> None:
     """Claim a job, do it, and record its outcome; do nothing if it cannot be claimed."""
     store = workplace.store
     job = patiently(lambda: store.claim(job_id, time.time(), workplace.name), DatabaseAway)

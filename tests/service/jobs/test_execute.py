@@ -13,7 +13,7 @@ import pytest
 
 from stillpath.pipeline.progress import Progress
 from stillpath.service.jobs import patience
-from stillpath.service.jobs.attempt import Workplace
+from stillpath.service.jobs.attempt import WorkerEnvironment
 from stillpath.service.jobs.state import WAITING_FOR_ROOM, Job, JobState, Lost
 from stillpath.service.jobs.watch import STUCK_EXIT_CODE
 from stillpath.service.jobs.worker import execute
@@ -32,7 +32,7 @@ class Bench:
     ends: list[int] = field(default_factory=list)
 
     def run(self, job_id: str, runner: Any = light, storage: Any = None) -> Job:
-        workplace = Workplace(
+        workplace = WorkerEnvironment(
             self.site.settings.model_copy(update=self.limits),
             self.site.store,
             storage or self.site.storage,
@@ -50,7 +50,9 @@ def test_a_job_is_claimed_once(site: Site):
     job_id = site.submit("G1 X1")
     first = Bench(site).run(job_id)
     assert Bench(site).run(job_id) == first
-    execute("0" * 32, Workplace(site.settings, site.store, site.storage, site.data_dir), light)
+    execute(
+        "0" * 32, WorkerEnvironment(site.settings, site.store, site.storage, site.data_dir), light
+    )
 
 
 @pytest.mark.parametrize(("word", "status"), [("bad", 422), ("crash", 500)])
@@ -104,7 +106,7 @@ def test_an_attempt_that_finishes_too_late_changes_nothing(site: Site):
     def late(task: Any, progress: Any) -> dict[str, Any]:
         summary = light(task, progress)
         site.store.apply(job_id, Lost(1, time.time(), "test", 3))
-        other = Workplace(site.settings, site.store, site.storage, site.data_dir / "other")
+        other = WorkerEnvironment(site.settings, site.store, site.storage, site.data_dir / "other")
         execute(job_id, other, light)
         return summary
 
