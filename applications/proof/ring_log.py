@@ -164,12 +164,12 @@ def read_axis(
 
 
 def residual(accel: Array, stops: Sequence[Stop], band: FrequencyBand) -> Power:
-    """Return the vibration in a band after each stop."""
+    """Return the vibration in a band after each stop; `accel`, (n,), is in mm/s^2 at `RATE_HZ`."""
     return _power(accel, [stop.at_s + WINDOW_S[0] for stop in stops], band)
 
 
 def floor(log: AxisLog, motion: RingMotion, band: FrequencyBand) -> Power:
-    """Return the same before the first move: vibration that the machine does not cause."""
+    """Return the vibration before the first move, which the machine does not cause."""
     length_s = WINDOW_S[1] - WINDOW_S[0]
     starts = [
         start
@@ -190,6 +190,11 @@ def misses(log: AxisLog, motion: RingMotion, predicted: Array, band: FrequencyBa
 
     The rms of measured minus predicted acceleration over that of the measured one, gain and lag of
     the sensor fitted, its noise floor taken off both.
+
+    Parameters
+    ----------
+    predicted : ndarray, shape (n,)
+        Acceleration along the log's axis, mm/s^2 at `RATE_HZ`, as long as the log.
     """
     own = np.flatnonzero(motion.about[log.axis] & log.inside)
     at = np.arange(len(predicted))
@@ -207,7 +212,7 @@ def misses(log: AxisLog, motion: RingMotion, predicted: Array, band: FrequencyBa
 
 
 def lag_s(log: AxisLog, motion: RingMotion, predicted: Array) -> float:
-    """Return the delay of the log relative to a prediction, below the modes."""
+    """Return the delay of the log relative to a prediction (as of `misses`), below the modes."""
     m, p = (band_pass(x, 1.0 / RATE_HZ, *_LAG_BAND_HZ) for x in (log.measured, predicted))
     kept = motion.about[log.axis] & log.inside
     shifts = np.arange(-_LAG_SAMPLES, _LAG_SAMPLES + 1)
