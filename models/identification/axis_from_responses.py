@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from stillpath.models.identification.averaging import mean_response
-from stillpath.models.identification.axis_from_spectra import AxisTask, from_magnitudes
+from stillpath.models.identification.axis_from_spectra import IdentificationTask, from_magnitudes
 from stillpath.models.identification.clocks import Lateness
 from stillpath.models.identification.conditioned import scheduled, special, usual
 from stillpath.models.identification.conditions import Condition
@@ -41,7 +41,7 @@ class ResponseRun(NamedTuple):
     condition: Condition
 
 
-def from_responses(task: AxisTask, runs: Sequence[ResponseRun]) -> AxisIdentification:
+def from_responses(task: IdentificationTask, runs: Sequence[ResponseRun]) -> AxisIdentification:
     """Return the axis with plants that explain its responses."""
     common = usual([run.condition for run in runs], task.axis)
     chosen = [run.response for run in runs if run.condition in common]
@@ -53,7 +53,7 @@ def from_responses(task: AxisTask, runs: Sequence[ResponseRun]) -> AxisIdentific
 
 
 def from_logs(
-    task: AxisTask, felt: Sequence[RawRun], frame_likely: float
+    task: IdentificationTask, felt: Sequence[RawRun], frame_likely: float
 ) -> tuple[AxisIdentification, list[Lateness]]:
     """Return the axis with plants that explain its raw logs, and how late it follows in each.
 
@@ -98,13 +98,13 @@ def from_logs(
     return found, late
 
 
-def _is_frame_firm(task: AxisTask, runs: Sequence[RawRun | ResponseRun]) -> bool:
+def _is_frame_firm(task: IdentificationTask, runs: Sequence[RawRun | ResponseRun]) -> bool:
     # A schedule counts the modes of the plant as it was fitted.
     return task.settings.frame_firm or bool(special([run.condition for run in runs]))
 
 
 def _fitted(
-    task: AxisTask,
+    task: IdentificationTask,
     chosen: Sequence[FrequencyResponse],
     *,
     frame_firm: bool,
@@ -126,7 +126,7 @@ def _fitted(
 
 
 def _scheduled(
-    task: AxisTask,
+    task: IdentificationTask,
     found: AxisIdentification,
     nominal: Fit,
     runs: Sequence[RawRun | ResponseRun],

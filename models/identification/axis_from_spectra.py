@@ -35,11 +35,11 @@ from stillpath.models.identification.types import Axis, AxisIdentification, Fit
 from stillpath.models.notes import by_file
 from stillpath.models.provenance import Kind
 
-__all__ = ["AxisTask", "Explained", "explain", "from_magnitudes", "from_spectra"]
+__all__ = ["ExplainedRuns", "IdentificationTask", "explain", "from_magnitudes", "from_spectra"]
 
 
 @dataclass(frozen=True, slots=True)
-class AxisTask:
+class IdentificationTask:
     """What is asked of one axis, whatever it was measured with.
 
     Attributes
@@ -60,7 +60,7 @@ class AxisTask:
     progress: Callable[[float], None]
 
 
-class Explained(NamedTuple):
+class ExplainedRuns(NamedTuple):
     """Spectra of an axis, their usual conditions, and what explains those of these."""
 
     runs: Sequence[SpectrumRun]
@@ -68,7 +68,7 @@ class Explained(NamedTuple):
     by: Explanations
 
 
-def explain(task: AxisTask, runs: Sequence[SpectrumRun]) -> Explained:
+def explain(task: IdentificationTask, runs: Sequence[SpectrumRun]) -> ExplainedRuns:
     """Find what explains the spectra that were measured under the usual conditions."""
     common = usual([run.condition for run in runs], task.axis)
     check_labels(common, task.axis)
@@ -80,10 +80,12 @@ def explain(task: AxisTask, runs: Sequence[SpectrumRun]) -> Explained:
         max_order=task.max_order,
         progress=task.progress,
     )
-    return Explained(runs, common, by)
+    return ExplainedRuns(runs, common, by)
 
 
-def from_spectra(task: AxisTask, explained: Explained, frame_likely: float) -> AxisIdentification:
+def from_spectra(
+    task: IdentificationTask, explained: ExplainedRuns, frame_likely: float
+) -> AxisIdentification:
     """Return the axis with plants that explain its spectra.
 
     Parameters
@@ -118,7 +120,11 @@ def from_spectra(task: AxisTask, explained: Explained, frame_likely: float) -> A
 
 
 def from_magnitudes(
-    task: AxisTask, logs: Sequence[RawRun], friction: Friction, fault: str, frame_likely: float
+    task: IdentificationTask,
+    logs: Sequence[RawRun],
+    friction: Friction,
+    fault: str,
+    frame_likely: float,
 ) -> AxisIdentification:
     """Return the axis from the spectra of its logs.
 

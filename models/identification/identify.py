@@ -18,8 +18,8 @@ from stillpath.models.identification.axis_from_responses import (
     from_responses,
 )
 from stillpath.models.identification.axis_from_spectra import (
-    AxisTask,
-    Explained,
+    ExplainedRuns,
+    IdentificationTask,
     explain,
     from_spectra,
 )
@@ -174,7 +174,7 @@ class _AxisWork:
         steps: _Steps,
     ) -> None:
         self._axis, self._settings, self._steps = axis, settings, steps
-        self._explained: Explained | None = None
+        self._explained: ExplainedRuns | None = None
         self.late: list[Lateness] = []
         kind = next(k for k in _BEST_FIRST if any(isinstance(m.measurement, k) for m in measured))
         self._used = [m for m in measured if isinstance(m.measurement, kind)]
@@ -185,7 +185,7 @@ class _AxisWork:
             measured_on=max(filter(None, map(date_in_name, names)), default=None),
         )
         fitting = steps.within(f"axis {axis}: fitting")
-        self._task = AxisTask(axis, _KINDS[kind], settings, origin, max_order, fitting)
+        self._task = IdentificationTask(axis, _KINDS[kind], settings, origin, max_order, fitting)
 
     def explain_spectra(self) -> float | None:
         """Find what explains spectra; return where the frame's mode may be in it, in Hz."""
