@@ -244,7 +244,7 @@ def test_nothing_assumed_when_everything_is_said() -> None:
     assert assumed_test(spectrum("a.csv", None), settings).excitation.direction == (0.0, 1.0)
 
 
-def test_refusals() -> None:
+def test_settings_that_contradict_themselves_or_the_file_are_refused() -> None:
     with pytest.raises(ModelError, match=r"a\.csv: neither the file nor its name says which axis"):
         assumed_test(spectrum("a.csv", None))
     with pytest.raises(ModelError, match=r"'z' is not a direction of the plane; .* tests along Z"):
