@@ -92,7 +92,13 @@ def spectrum_along(aligned: AlignedLog, log: AccelerationLog, column: str) -> Sp
     time_s = np.arange(len(aligned.measured_mm_s2)) / aligned.rate_hz
     f_hz, psd = klipper_psd(time_s, aligned.measured_mm_s2)
     told = f_hz <= _TABLE_HZ
-    return Spectrum(f_hz[told], {column: psd[told]}, axis=log.axis, source=log.source)
+    return Spectrum(
+        f_hz[told],
+        {column: psd[told]},
+        axis=log.axis,
+        source=log.source,
+        accel_per_hz_mm_s=aligned.excitation.accel_per_hz_mm_s,
+    )
 
 
 def align(

@@ -132,7 +132,8 @@ def spectrum_in(run: RawRun, column: str) -> SpectrumRun:
     strength = run.aligned.excitation.accel_per_hz_mm_s
     test = replace(run.assumed.excitation, accel_per_hz_mm_s=strength)
     spectrum = spectrum_along(run.aligned, run.log, column)
-    return SpectrumRun(spectrum, test, run.condition, run.assumed.notes)
+    notes = (*run.assumed.notes, *run.aligned.notes)
+    return SpectrumRun(spectrum, test, run.condition, notes)
 
 
 def lateness_in(
