@@ -126,7 +126,7 @@ class Spectrum:
     axis: str | None = None
     source: str = ""
     accel_per_hz_mm_s: float | None = None
-    """If the file says (Kalico)."""
+    """If the file says (Kalico), or the log that it was made of."""
     notes: tuple[str, ...] = ()
 
 
