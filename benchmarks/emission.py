@@ -16,9 +16,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from inputs import find_input, plain_copy, shared_folder
 from numpy.typing import NDArray
 from quality import FILES, MACHINES
-from readback import DT_S, find_input, plain_copy, read_motion, shared_folder
+from readback import DT_S, read_motion
 
 from stillpath.gcode.pieces import Piece
 from stillpath.gcode.sampler import sample_phases

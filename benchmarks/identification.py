@@ -19,16 +19,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from readback import (
-    Aligned,
-    Judge,
-    Own,
-    find_input,
-    forced_stops,
-    plain_copy,
-    read_motion,
-    shared_folder,
-)
+from inputs import find_input, plain_copy, shared_folder
+from readback import Aligned, Judge, Own, forced_stops, read_motion
 
 from stillpath.applications.identification.run import InputFile, identify_files
 from stillpath.models.identification.identify import Measured, identify
