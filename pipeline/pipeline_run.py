@@ -31,6 +31,7 @@ from stillpath.gcode.types import Events, Moves, Phases, ProgramBlock
 from stillpath.models.errors import ModelError
 from stillpath.pipeline.clock import StageClock
 from stillpath.pipeline.endless import LengthGuard
+from stillpath.pipeline.file_dialect import dialect_for, dialect_warnings, extruder_mode_awaited
 from stillpath.pipeline.files import Discarding, default_cache_dir
 from stillpath.pipeline.job_design import design_job
 from stillpath.pipeline.last_check.comparing import LastCheck
@@ -53,7 +54,6 @@ from stillpath.pipeline.piece_compensator import (
     deviation,
 )
 from stillpath.pipeline.progress import ProgressReports
-from stillpath.pipeline.reading import dialect_for, doubts, extruder_mode_awaited
 from stillpath.pipeline.result import PutBack, Result, StageTime
 from stillpath.pipeline.selection import Selection, TooLarge
 from stillpath.pipeline.summary import Summary
@@ -170,7 +170,7 @@ class PipelineRun:
         ends = (self._writer.header(), self._writer.footer()) if self._changes else ()
         self._sum.written_bytes = sum(len(text) for text in ends)
         self.retiming = Retiming(*ends, keep_times=options.times == "kept" or not self._changes)
-        self._sum.warnings += [*doubts(source, machine, options.dialect), *unsaid]
+        self._sum.warnings += [*dialect_warnings(source, machine, options.dialect), *unsaid]
 
     @property
     def _pairs(self) -> BudgetMeasurement | None:
