@@ -38,12 +38,12 @@ from stillpath.service.settings import Settings
 from stillpath.service.storage import Storage, StorageError, sha256_of
 from stillpath.service.storage.disk import DISK_FULL, Disk, PeakDiskUse, written_bytes
 
-__all__ = ["Attempt", "WorkerEnvironment"]
+__all__ = ["Attempt", "WorkerContext"]
 
 
 @dataclass(frozen=True, slots=True)
-class WorkerEnvironment:
-    """The environment of a worker.
+class WorkerContext:
+    """What the attempts of a worker process share.
 
     Attributes
     ----------
@@ -73,11 +73,11 @@ class Attempt:
         As it was claimed.
     """
 
-    def __init__(self, job: Job, workplace: WorkerEnvironment, limits: AttemptLimits) -> None:
-        settings = workplace.settings
+    def __init__(self, job: Job, context: WorkerContext, limits: AttemptLimits) -> None:
+        settings = context.settings
         self._job, self._limits = job, limits
-        self._settings, self._store, self._storage = settings, workplace.store, workplace.storage
-        self._folder = workplace.scratch / f"{job.id}-{job.attempt}"
+        self._settings, self._store, self._storage = settings, context.store, context.storage
+        self._folder = context.scratch / f"{job.id}-{job.attempt}"
         self._disk = Disk(settings.data_dir, settings.disk_reserve_bytes)
         self._written = PeakDiskUse(self._folder)
         self._log = structlog.get_logger("worker")
