@@ -25,8 +25,8 @@ from pathlib import Path
 
 import numpy as np
 from firmwares import machine_with, without_macros
+from inputs import find_input, plain_copy, shared_folder
 from numpy.typing import NDArray
-from readback import find_input, plain_copy, shared_folder
 
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.registry import adapter

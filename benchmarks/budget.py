@@ -28,21 +28,10 @@ from pathlib import Path
 from statistics import geometric_mean
 
 import numpy as np
+from inputs import find_input, one_thread_each, plain_copy, shared_folder
 from numpy.typing import NDArray
 from quality import FILES, MACHINES, Task, best_shaper
-from readback import (
-    DT_S,
-    Judge,
-    Motion,
-    ReadBackError,
-    Shaped,
-    Timed,
-    find_input,
-    one_thread_each,
-    plain_copy,
-    read_motion,
-    shared_folder,
-)
+from readback import DT_S, Judge, Motion, ReadBackError, Shaped, Timed, read_motion
 
 from stillpath.gcode.sampler import sample_phases
 from stillpath.gcode.types import Phases, rows_of

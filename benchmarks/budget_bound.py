@@ -10,7 +10,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from readback import find_input, plain_copy, shared_folder
+from inputs import find_input, plain_copy, shared_folder
 
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.interpreter import Interpreter

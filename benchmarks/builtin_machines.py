@@ -14,7 +14,7 @@ import json
 import sys
 from pathlib import Path
 
-from readback import shared_folder
+from inputs import shared_folder
 
 from stillpath.applications.identification.run import InputFile, identify_files
 from stillpath.models.identification.readers import ReadSettings

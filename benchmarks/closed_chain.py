@@ -29,21 +29,8 @@ from pathlib import Path
 
 import numpy as np
 from firmwares import machine_with, without_macros
-from readback import (
-    DT_S,
-    WINDOW_S,
-    Aligned,
-    Motion,
-    Own,
-    Shaped,
-    Timed,
-    find_input,
-    forced_stops,
-    one_thread_each,
-    plain_copy,
-    read_motion,
-    shared_folder,
-)
+from inputs import find_input, one_thread_each, plain_copy, shared_folder
+from readback import DT_S, WINDOW_S, Aligned, Motion, Own, Shaped, Timed, forced_stops, read_motion
 from scipy.signal import ss2zpk
 
 from stillpath.applications.machines.checks import derived_envelope

@@ -16,9 +16,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from inputs import find_input, plain_copy, shared_folder
 from numpy.typing import NDArray
 from quality import FILES, MACHINES
-from readback import DT_S, find_input, plain_copy, read_motion, shared_folder
+from readback import DT_S, read_motion
 
 from stillpath.gcode.pieces import Piece
 from stillpath.gcode.sampler import sample_phases
@@ -30,7 +31,7 @@ from stillpath.pipeline.files import default_cache_dir
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.order import Order
 from stillpath.pipeline.piece_compensator import CompensatedPiece
-from stillpath.pipeline.pipeline_run import Attempt, PipelineRun
+from stillpath.pipeline.pipeline_run import PieceAttempt, PipelineRun
 from stillpath.pipeline.result import Result
 
 _BIN_UM, _BINS = 0.01, 40_000
@@ -73,7 +74,7 @@ class Watched(PipelineRun):
         """What of the extruding motion's distance lies along the command and across it."""
         self.late_s = self.off_grid_s = self.end_mm = 0.0
 
-    def _attempt(self, piece: Piece, paced: Piece) -> Attempt:
+    def _attempt(self, piece: Piece, paced: Piece) -> PieceAttempt:
         found = super()._attempt(piece, paced)
         self._watch(piece, found.made, found.executed)
         return found

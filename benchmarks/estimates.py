@@ -15,7 +15,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from readback import shared_folder
+from inputs import shared_folder
 
 from stillpath.gcode.containers.opening import open_text
 from stillpath.gcode.errors import GcodeError

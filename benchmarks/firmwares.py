@@ -17,8 +17,8 @@ import tempfile
 from pathlib import Path
 
 from emission import watched
+from inputs import find_input, plain_copy, shared_folder
 from quality import FILES, MACHINES, Row, Task, judged
-from readback import find_input, plain_copy, shared_folder
 
 from stillpath.models.firmware import Marlin, RepRapFirmware
 from stillpath.models.firmware.marlin import MarlinPlanner, PerAxis, PerAxisLimit

@@ -19,21 +19,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from readback import (
-    Aligned,
-    Judge,
-    Own,
-    find_input,
-    forced_stops,
-    plain_copy,
-    read_motion,
-    shared_folder,
-)
+from inputs import find_input, plain_copy, shared_folder
+from readback import Aligned, Judge, Own, forced_stops, read_motion
 
 from stillpath.applications.identification.run import InputFile, identify_files
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.identify import Measured, identify
-from stillpath.models.identification.readers import ReadSettings, excitation_for, read_measurements
+from stillpath.models.identification.readers import ReadSettings, assumed_test, read_measurements
 from stillpath.models.identification.shaper_choice import choose_shaper_of
 from stillpath.models.identification.spectrum_fit import explanations
 from stillpath.models.identification.synthetic import (
@@ -161,7 +153,7 @@ def real_tables(folder: Path) -> Iterator[str]:
     for path in files:
         (spectrum,) = read_measurements(path)
         assert isinstance(spectrum, Spectrum)
-        fit = explanations([spectrum], excitation_for(spectrum)).explained().fit
+        fit = explanations([spectrum], assumed_test(spectrum).excitation).explained().fit
         plant = continuous(fit.spec)
         dc = abs(float(np.real(plant.frequency_response(0.0)[0])) - 1)
         if plant.poles().real.max() >= 0 or dc > 1e-9 or fit.residual > 2.6 or fit.order > 4:

@@ -20,7 +20,7 @@ import sys
 import time
 from pathlib import Path
 
-from readback import shared_folder
+from inputs import shared_folder
 
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.interpreter import Interpreter

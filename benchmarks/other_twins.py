@@ -24,15 +24,8 @@ from pathlib import Path
 from statistics import geometric_mean
 
 import numpy as np
-from readback import (
-    Judge,
-    Shaped,
-    find_input,
-    one_thread_each,
-    plain_copy,
-    read_motion,
-    shared_folder,
-)
+from inputs import find_input, one_thread_each, plain_copy, shared_folder
+from readback import Judge, Shaped, read_motion
 from scipy.optimize import OptimizeResult, least_squares
 from twins import Row, judged
 

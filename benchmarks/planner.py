@@ -11,8 +11,9 @@ import sys
 from pathlib import Path
 
 import numpy as np
+from inputs import shared_folder
 from numpy.typing import NDArray
-from readback import read_motion, shared_folder
+from readback import read_motion
 
 from stillpath.gcode.types import Phases
 from stillpath.models.machine import Machine

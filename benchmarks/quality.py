@@ -30,19 +30,8 @@ from multiprocessing import get_context
 from pathlib import Path
 from statistics import geometric_mean
 
-from readback import (
-    Aligned,
-    Judge,
-    Motion,
-    Own,
-    Shaped,
-    find_input,
-    forced_stops,
-    one_thread_each,
-    plain_copy,
-    read_motion,
-    shared_folder,
-)
+from inputs import find_input, one_thread_each, plain_copy, shared_folder
+from readback import Aligned, Judge, Motion, Own, Shaped, forced_stops, read_motion
 
 from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine

@@ -7,8 +7,6 @@ the firmware's rules and sampled at 10 kHz, and the continuous plants answer tha
 from __future__ import annotations
 
 import gzip
-import os
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import pairwise
@@ -39,11 +37,8 @@ __all__ = [
     "ReadBackError",
     "Shaped",
     "Timed",
-    "find_input",
     "forced_stops",
-    "plain_copy",
     "read_motion",
-    "shared_folder",
 ]
 
 T = TypeVar("T", Moves, Phases)
@@ -64,43 +59,6 @@ _STOPPING = np.array([int(kind) for kind in sorted(STOPPING)])
 
 class ReadBackError(RuntimeError):
     """The written file does not do what the original does."""
-
-
-def shared_folder(given: Path | None = None) -> Path | None:
-    """Return the folder of shared data: as given, $STILLPATH_SHARED, or beside the checkout."""
-    root = Path(__file__).resolve().parent.parent
-    named = os.environ.get("STILLPATH_SHARED")
-    folder = given or (Path(named) if named else root.parent / "shared")
-    return folder if folder.is_dir() else None
-
-
-def one_thread_each() -> None:
-    """Keep processes that work side by side to one thread each; libraries read it when loaded."""
-    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ.setdefault(name, "1")
-
-
-def find_input(name: str, shared: Path | None) -> Path:
-    """Return a print file by path, or by its name in the shared corpus."""
-    path = Path(name)
-    if path.is_file():
-        return path
-    for folder in ("own", "third_party", "third-party"):
-        for ending in (".gcode.gz", ".gcode"):
-            if shared is not None and (shared / "corpus" / folder / f"{name}{ending}").is_file():
-                return shared / "corpus" / folder / f"{name}{ending}"
-    sys.exit(f"there is no file {name}, and no such name in the shared corpus")
-
-
-def plain_copy(source: Path, folder: Path) -> Path:
-    """Return the path of the file without compression, made in `folder` if need be."""
-    if source.suffix != ".gz":
-        return source
-    target = folder / source.stem
-    with gzip.open(source) as packed, target.open("wb") as out:
-        while data := packed.read(_READ_BYTES):
-            out.write(data)
-    return target
 
 
 @dataclass(frozen=True, slots=True)

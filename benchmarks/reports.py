@@ -15,17 +15,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from inputs import find_input, plain_copy, shared_folder
 from numpy.typing import NDArray
-from readback import (
-    DT_S,
-    Aligned,
-    Judge,
-    find_input,
-    forced_stops,
-    plain_copy,
-    read_motion,
-    shared_folder,
-)
+from readback import DT_S, Aligned, Judge, forced_stops, read_motion
 
 from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine

@@ -20,8 +20,9 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+from inputs import find_input, plain_copy, shared_folder
 from numpy.typing import NDArray
-from readback import DT_S, Own, find_input, plain_copy, read_motion, shared_folder
+from readback import DT_S, Own, read_motion
 
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.registry import compensator

@@ -19,7 +19,7 @@ from typing import Any
 from unittest.mock import patch
 
 import numpy as np
-from readback import find_input, plain_copy, shared_folder
+from inputs import find_input, plain_copy, shared_folder
 from scipy.optimize import linprog
 
 from stillpath.gcode._segment_kernels import path_directions

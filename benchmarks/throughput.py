@@ -23,7 +23,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from readback import find_input, plain_copy, shared_folder
+from inputs import find_input, plain_copy, shared_folder
 
 from stillpath.models.store import load_machine
 from stillpath.pipeline.compensate import compensate_file

@@ -24,19 +24,9 @@ from pathlib import Path
 from statistics import geometric_mean
 
 from builtin_machines import TABLES
+from inputs import find_input, one_thread_each, plain_copy, shared_folder
 from quality import FILES, Task, best_shaper
-from readback import (
-    Aligned,
-    Judge,
-    Own,
-    Shaped,
-    find_input,
-    forced_stops,
-    one_thread_each,
-    plain_copy,
-    read_motion,
-    shared_folder,
-)
+from readback import Aligned, Judge, Own, Shaped, forced_stops, read_motion
 
 from stillpath.applications.identification.run import InputFile, identify_files
 from stillpath.models.identification.readers import ReadSettings

@@ -13,7 +13,7 @@ import tempfile
 from itertools import product
 from pathlib import Path
 
-from readback import find_input, plain_copy, shared_folder
+from inputs import find_input, plain_copy, shared_folder
 
 from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from stillpath.cli.arguments import PlateOption, Refused, check_input, check_output
+from stillpath.cli.arguments import CommandRefused, PlateOption, check_input, check_output
 
 __all__ = ["remove_advice"]
 
@@ -22,7 +22,7 @@ def remove_advice(
 ) -> None:
     """Take out the lines that `compensate --method advise` has added."""
     if in_place == (output is not None):
-        raise Refused("give either -o OUT or --in-place")
+        raise CommandRefused("give either -o OUT or --in-place")
     check_input(source)
     target = check_output(output, source) if output else check_output(source)
 

@@ -17,6 +17,7 @@ __all__ = [
     "METHODS",
     "BasisOption",
     "BudgetOption",
+    "CommandRefused",
     "CompensationOptions",
     "DialectOption",
     "Input",
@@ -24,7 +25,6 @@ __all__ = [
     "MachineOption",
     "MethodOption",
     "PlateOption",
-    "Refused",
     "ReportOption",
     "RobustOption",
     "ServerOption",
@@ -170,19 +170,19 @@ class CompensationOptions:
         return chosen_options(**given, times=times, plate=plate)
 
 
-class Refused(Exception):
+class CommandRefused(Exception):
     """The command cannot be carried out as given."""
 
 
 def check_input(source: Path) -> None:
     """Refuse anything but a regular file: the pipeline reads it twice."""
     if source.is_dir():
-        raise Refused(f"{source} is a folder, not a G-code file")
+        raise CommandRefused(f"{source} is a folder, not a G-code file")
     if not source.exists():
-        raise Refused(f"{source} does not exist")
+        raise CommandRefused(f"{source} does not exist")
     if not source.is_file():
         # The pipeline reads a file twice, and opening a pipe waits for somebody to write.
-        raise Refused(f"{source} is a pipe or a device; save it as a file first")
+        raise CommandRefused(f"{source} is a pipe or a device; save it as a file first")
 
 
 def check_output(target: Path, *inputs: Path | str | None) -> Path:
@@ -194,25 +194,27 @@ def check_output(target: Path, *inputs: Path | str | None) -> Path:
         What the command reads, as it was named; no file of these is replaced.
     """
     if str(target) == "-":
-        raise Refused("nothing is written to the standard output; name a file instead of -")
+        raise CommandRefused("nothing is written to the standard output; name a file instead of -")
     if target.is_dir():
-        raise Refused(f"{target} is a folder; name the file to write")
+        raise CommandRefused(f"{target} is a folder; name the file to write")
     if target.exists() and not target.is_file():
-        raise Refused(f"{target} is a pipe or a device; name a file to write")
+        raise CommandRefused(f"{target} is a pipe or a device; name a file to write")
     # A link is followed, so that what it points to is replaced and not the link.
     target = target.resolve()
     if not target.parent.is_dir():
-        raise Refused(f"the folder {target.parent} does not exist; make it first")
+        raise CommandRefused(f"the folder {target.parent} does not exist; make it first")
     for each in inputs:
         if each and target.exists() and Path(each).exists() and target.samefile(each):
-            raise Refused(f"{target} is an input of this command; name another file to write")
+            raise CommandRefused(
+                f"{target} is an input of this command; name another file to write"
+            )
     return target
 
 
 def check_folder(folder: Path | None, option: str = "--report") -> None:
     """Refuse a folder to write into that is a file."""
     if folder is not None and folder.exists() and not folder.is_dir():
-        raise Refused(f"{option} {folder} is a file; name a folder")
+        raise CommandRefused(f"{option} {folder} is a file; name a folder")
 
 
 def chosen_options(**given: Any) -> Options:
@@ -225,4 +227,4 @@ def chosen_options(**given: Any) -> Options:
     try:
         return Options(**{name: value for name, value in given.items() if value is not None})
     except ValidationError as error:
-        raise Refused(wrong_option(error)) from None
+        raise CommandRefused(wrong_option(error)) from None

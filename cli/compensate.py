@@ -8,13 +8,13 @@ from typing import Annotated, Any
 import typer
 
 from stillpath.cli.arguments import (
+    CommandRefused,
     CompensationOptions,
     DialectOption,
     Input,
     KeyOption,
     MachineOption,
     PlateOption,
-    Refused,
     ReportOption,
     ServerOption,
     check_folder,
@@ -49,12 +49,14 @@ def compensate(
 ) -> None:
     """Write a compensated file, and print what was measured on it."""
     if in_place == (output is not None):
-        raise Refused("give either -o OUT or --in-place")
+        raise CommandRefused("give either -o OUT or --in-place")
     options = how.chosen(plate)
     check_input(source)
     target = check_output(output or source, machine)
     if output is not None and target.exists() and target.samefile(source):
-        raise Refused(f"{output} is the input; name another file, or use --in-place instead of -o")
+        raise CommandRefused(
+            f"{output} is the input; name another file, or use --in-place instead of -o"
+        )
     check_folder(report)
     _check_apart(report, target)
     if server:
@@ -133,7 +135,7 @@ def _check_apart(report: Path | None, target: Path) -> None:
         return
     folder = report.resolve()
     if target == folder or (target.parent == folder and target.name.lower() in _OF_REPORT):
-        raise Refused(
+        raise CommandRefused(
             f"{target} would be the report's own; name another file, or folder (--report)"
         )
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from stillpath.cli.arguments import Refused, check_folder, check_output
+from stillpath.cli.arguments import CommandRefused, check_folder, check_output
 
 if TYPE_CHECKING:
     from stillpath.applications.controllers.design import Designed
@@ -97,7 +97,7 @@ class OutputOptions:
         """Refuse what cannot be written, before anything is computed."""
         files = [file for file in (self.json_file, self.c_header) if file is not None]
         if len({check_output(file, *inputs) for file in files}) < len(files):
-            raise Refused(f"--json and --c-header are both {files[0]}; name two files")
+            raise CommandRefused(f"--json and --c-header are both {files[0]}; name two files")
         check_folder(self.report)
 
     def write(self, made: Designed) -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 
 import typer
 
-from stillpath.cli.arguments import Refused, check_folder, check_output
+from stillpath.cli.arguments import CommandRefused, check_folder, check_output
 from stillpath.cli.own_machines import RevisionNote, open_documents, open_machines, who
 from stillpath.models.errors import ModelError
 
@@ -188,7 +188,7 @@ def identify(
     if target.output is not None:
         check_output(target.output, *files, *(file.rpartition("@")[0] for file in files))
     if ripple.ripple and report is not None:
-        raise Refused("--report shows plants, and --ripple learns none: leave --report out")
+        raise CommandRefused("--report shows plants, and --ripple learns none: leave --report out")
     check_folder(report)
     machines = open_machines()
     start, expected = _start(machines, target.machine, target.base)

@@ -36,7 +36,7 @@ from stillpath.cli import (
     trajectories,
     warm,
 )
-from stillpath.cli.arguments import Refused
+from stillpath.cli.arguments import CommandRefused
 from stillpath.cli.batch import commands as batch
 from stillpath.cli.groups import GroupedCommands
 from stillpath.cli.option_groups import grouped
@@ -124,7 +124,7 @@ def run(arguments: list[str]) -> int:
         return _fail("interrupted; nothing was written", interruption.exit_code)
     except typer.TyperException as error:
         return _fail(f"{_of_usage(error)} (stillpath COMMAND --help lists the options)", 2)
-    except Refused as error:
+    except CommandRefused as error:
         return _fail(str(error), 2)
     except MemoryError:
         return _fail("out of memory; close other programs or use a larger machine", 1)

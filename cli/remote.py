@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import typer
 
-from stillpath.cli.arguments import KeyOption, Refused, ServerOption, check_output
+from stillpath.cli.arguments import CommandRefused, KeyOption, ServerOption, check_output
 
 if TYPE_CHECKING:
     from stillpath.pipeline.options import Options
@@ -145,7 +145,7 @@ def fetch(
         found = client.job(job)
         named = output or Path(safe_name(found.result_name))
         if output is None and named.exists():
-            raise Refused(f"{named} exists; name the file with -o to replace it")
+            raise CommandRefused(f"{named} exists; name the file with -o to replace it")
         target = check_output(named)
         with _progress() as tell:
             client.fetch(found, target, tell=tell)

@@ -267,7 +267,7 @@ def plant_set(spec: PlantSetSpec, dt_s: float) -> PlantSet:
 def frequency_response(
     plant: PlantSpec | ContinuousPlant | DiscretePlant, f_hz: ArrayLike
 ) -> Complex:
-    """Return the response at `f_hz`; a document answers from its roots, without realisation."""
+    """Return the response at `f_hz`, of its shape; a document answers from its roots."""
     if isinstance(plant, (ContinuousPlant, DiscretePlant)):
         return plant.frequency_response(f_hz)
     f = np.atleast_1d(np.asarray(f_hz, float))

@@ -40,7 +40,7 @@ def reference_limits(machine: Machine) -> tuple[float, float]:
 
 
 def reference_motion_of(machine: Machine, dt_s: float = 1e-3) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the reference motion as the firmware of a machine would plan it.
+    """Return the reference motion (`reference_motion`) as the firmware of a machine would plan it.
 
     Motion that it would never plan is of no interest.
     """

@@ -14,10 +14,10 @@ import numpy as np
 
 from stillpath.pipeline.files import replacing
 
-__all__ = ["Table", "csv_table", "npz_table"]
+__all__ = ["TableWriter", "csv_table", "npz_table"]
 
 
-class Table(Protocol):
+class TableWriter(Protocol):
     """A table that takes rows."""
 
     def write(self, columns: Mapping[str, np.ndarray]) -> None:
@@ -28,7 +28,7 @@ class Table(Protocol):
 
 
 @contextlib.contextmanager
-def npz_table(target: Path, types: Mapping[str, str]) -> Iterator[Table]:
+def npz_table(target: Path, types: Mapping[str, str]) -> Iterator[TableWriter]:
     """Yield a table that becomes an npz file of one array per column, whole or not at all.
 
     Parameters
@@ -56,7 +56,7 @@ def npz_table(target: Path, types: Mapping[str, str]) -> Iterator[Table]:
 
 
 @contextlib.contextmanager
-def csv_table(target: Path, formats: Mapping[str, str]) -> Iterator[Table]:
+def csv_table(target: Path, formats: Mapping[str, str]) -> Iterator[TableWriter]:
     """Yield a table that becomes a CSV file with a line of names, whole or not at all.
 
     Parameters

@@ -103,7 +103,7 @@ def unseen_friction_mm(axis: PlantSetSpec) -> float:
 
 
 def nominal_response(machine: Machine, command: Array, dt_s: float) -> Array:
-    """Return the nominal plants' response to a command, dry friction included."""
+    """Return the response of the nominal plants, dry friction included: both (2, n) in mm."""
     pair = [plant_set(machine.axes[axis], dt_s).nominal for axis in ("x", "y")]
     return response(pair, DryFriction(machine.friction_mm, dt_s).received_mm(command))
 

@@ -23,6 +23,11 @@ def retract_along(command: Array, timeline: Timeline, phases: Phases) -> None:
 
     Klipper limits such moves by E per mm of XY. The command may stand where the plan creeps, and
     vice versa: filament at the plan's times would need impossible accelerations.
+
+    Parameters
+    ----------
+    command : ndarray, shape (4, n)
+        X Y Z E in mm on the timeline's grid.
     """
     wipes = phases.moves_xy & (phases.direction[:, 3] < 0.0)
     if not np.any(wipes):
@@ -47,6 +52,12 @@ def feed_evenly(command: Array, extruding: NDArray[np.bool_]) -> None:
 
     In corners the command's speed differs from the plan's, which the filament follows: the filament
     per mm of path is uneven there, and firmwares brake for it, more so on thick lines.
+
+    Parameters
+    ----------
+    command : ndarray, shape (4, n)
+        X Y Z E in mm.
+    extruding : ndarray of bool, shape (n,)
     """
     way_mm, area = np.empty((2, command.shape[1]))
     for first, end in runs(extruding):

@@ -23,10 +23,15 @@ from stillpath.gcode.types import EventKind, Moves, Phases, ProgramBlock, joined
 from stillpath.models.machine import Machine
 from stillpath.models.shaping import OFF, Shaping
 from stillpath.pipeline.endless import LengthGuard
+from stillpath.pipeline.file_dialect import (
+    dialect_for,
+    dialect_warnings,
+    skipped_notes,
+    skipped_warnings,
+)
 from stillpath.pipeline.measuring.points import MotionSamples
 from stillpath.pipeline.options import DialectName
 from stillpath.pipeline.progress import ProgressCallback, ProgressReports, progress_to
-from stillpath.pipeline.reading import dialect_for, doubts, passed_over, perhaps_passed_over
 
 __all__ = ["STANDING_S", "FileMotion", "MotionPart", "TextMotion"]
 
@@ -129,12 +134,12 @@ class TextMotion:
     @property
     def warnings(self) -> list[str]:
         """Return warnings about commands that the firmware skips, or that are not modelled."""
-        return [*passed_over(self.reader), *sorted(self._unmodelled)]
+        return [*skipped_warnings(self.reader), *sorted(self._unmodelled)]
 
     @property
     def notes(self) -> list[str]:
         """Return notes on commands that the firmware skips unless the printer has them."""
-        return perhaps_passed_over(self.reader)
+        return skipped_notes(self.reader)
 
     def __iter__(self) -> Iterator[MotionPart]:
         file = self._file
@@ -290,7 +295,7 @@ class FileMotion:
         unpacking = progress_to(self._progress, "unpacking", 0.0)
         with open_text(self.source, plate=self._plate, progress=unpacking) as container:
             self.facts = container.facts()
-            doubtful = doubts(container.text, self.machine, self._asked)
+            doubtful = dialect_warnings(container.text, self.machine, self._asked)
             motion = TextMotion(
                 container.text,
                 self.machine,

@@ -432,7 +432,7 @@ def _error_filter(machine: Machine) -> ErrorFilter:
 
 
 def deviation(piece: CompensatedPiece, executed: Phases) -> NDArray[np.float64]:
-    """Return the XY distance of the executed motion from the command at the command's samples.
+    """Return the XY distance [mm] of executed motion from the command at its samples, shape (n,).
 
     Each stretch is timed from its own start: rests may be slightly longer or shorter than planned.
     """

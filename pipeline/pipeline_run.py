@@ -12,7 +12,6 @@ import copy
 import io
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
@@ -30,15 +29,15 @@ from stillpath.gcode.slicers.retiming import Retiming
 from stillpath.gcode.splitter import Splitter
 from stillpath.gcode.types import Events, Moves, Phases, ProgramBlock
 from stillpath.models.errors import ModelError
-from stillpath.pipeline.caution import caution_for
 from stillpath.pipeline.clock import StageClock
 from stillpath.pipeline.endless import LengthGuard
+from stillpath.pipeline.file_dialect import dialect_for, dialect_warnings, extruder_mode_awaited
 from stillpath.pipeline.files import Discarding, default_cache_dir
+from stillpath.pipeline.job_design import design_job
 from stillpath.pipeline.last_check.comparing import LastCheck
 from stillpath.pipeline.measuring.layer_files import LayerWriter
 from stillpath.pipeline.measuring.measure import Measurement
 from stillpath.pipeline.measuring.points import MotionSamples, part_of
-from stillpath.pipeline.measuring.reference_shaper import cached_shaper
 from stillpath.pipeline.measuring.tracing import Trace
 from stillpath.pipeline.motion_record import Followers, MotionRecord
 from stillpath.pipeline.operating_point import Operation
@@ -51,12 +50,10 @@ from stillpath.pipeline.parts import FileParts
 from stillpath.pipeline.piece_compensator import (
     DT_S,
     CompensatedPiece,
-    PieceCompensator,
     Unfit,
     deviation,
 )
 from stillpath.pipeline.progress import ProgressReports
-from stillpath.pipeline.reading import dialect_for, doubts, extruder_mode_awaited
 from stillpath.pipeline.result import PutBack, Result, StageTime
 from stillpath.pipeline.selection import Selection, TooLarge
 from stillpath.pipeline.summary import Summary
@@ -74,7 +71,7 @@ from stillpath.pipeline.verifying import Verifier
 if TYPE_CHECKING:
     from _typeshed import SupportsWrite
 
-__all__ = ["COMPENSATED", "Attempt", "PipelineRun"]
+__all__ = ["COMPENSATED", "PieceAttempt", "PipelineRun"]
 
 _EXPLAINED = (Unfit, GcodeError, DesignError, ModelError)
 """Errors whose message tells the user why a piece cannot be compensated."""
@@ -87,8 +84,8 @@ COMPENSATED = 0.99
 
 
 @dataclass(frozen=True, slots=True)
-class Attempt:
-    """A piece as it may be written."""
+class PieceAttempt:
+    """A piece as it may be written, its motion as read back, and its gap (n,) from the command."""
 
     made: CompensatedPiece
     executed: Phases
@@ -100,7 +97,9 @@ class Attempt:
 class PipelineRun:
     """One run of the pipeline over one file.
 
-    The text stays in `target` until its times are known; `retiming` then copies it.
+    The text stays in `target` until its times are known; `retiming` then copies it. Two
+    interpreters follow the file side by side: `_reader` the sliced one, `_checker` what is written
+    of it. Where the file is not changed there is no `_piece_compensator`, `_verifier` or `_writer`.
 
     Parameters
     ----------
@@ -142,7 +141,8 @@ class PipelineRun:
         self._restarts_written = copy.copy(self._restarts_sliced)
         if self._changes and self._adapter.refusal is not None:
             raise ModelError(f"{machine.name} cannot execute this file: {self._adapter.refusal}")
-        self._design(order.cache_dir or default_cache_dir())
+        cache_dir = order.cache_dir or default_cache_dir()
+        self._design = design_job(machine, options, cache_dir, self._clock, self._say)
         own = dialect_for(machine, options.dialect)
         dialect, unsaid = extruder_mode_awaited(source, machine, own)
         self._length = LengthGuard(source, machine, dialect)
@@ -155,39 +155,22 @@ class PipelineRun:
         self._measurement = measures(
             machine,
             DT_S,
-            self._shaper,
+            self._design.shaper,
             take_layer=layers.add if layers else None,
             trace=trace,
             size=source.seek(0, io.SEEK_END),
         )
         followers = None
-        if self._changes:
+        if self._design.piece_compensator is not None:
+            self._piece_compensator = self._design.piece_compensator
             self._verifier = Verifier(machine, options.tolerance_um)
             self._writer = StreamWriter(self._adapter, stamp(machine, options))
-            followers = Followers(self._designed.compensator, self._verifier)
+            followers = Followers(self._piece_compensator.compensator, self._verifier)
         self._motion = MotionRecord(self._adapter.step_mm, self._measurement, self._sum, followers)
         ends = (self._writer.header(), self._writer.footer()) if self._changes else ()
         self._sum.written_bytes = sum(len(text) for text in ends)
         self.retiming = Retiming(*ends, keep_times=options.times == "kept" or not self._changes)
-        self._sum.warnings += [*doubts(source, machine, options.dialect), *unsaid]
-
-    def _design(self, cache_dir: Path) -> None:
-        """Tune the reference shaper and design the command."""
-        machine, options = self._machine, self._options
-        # Design first: a design error should show before the slow tuning of the shaper.
-        tuned_first = options.method.startswith("shaper:")
-        if self._changes and not tuned_first:
-            self._say("designing", 0.0)
-            with self._clock.stage("design"):
-                self._designed = PieceCompensator(machine, options)
-        self._say("tuning the shaper to compare with", 0.0)
-        with self._clock.stage("reference shaper"):
-            self._shaper = cached_shaper(machine, cache_dir, DT_S)
-            chosen = caution_for(machine, options, self._shaper, cache_dir, DT_S)
-        self._caution = chosen[0] if chosen else None
-        self._choice = chosen[1] if chosen else None
-        if tuned_first or self._caution is not None:
-            self._designed = PieceCompensator(machine, options, self._shaper, self._caution)
+        self._sum.warnings += [*dialect_warnings(source, machine, options.dialect), *unsaid]
 
     @property
     def _pairs(self) -> BudgetMeasurement | None:
@@ -276,8 +259,9 @@ class PipelineRun:
                 dialect_for(self._machine, self._options.dialect),
                 lambda read: self._say("choosing speeds", _CHOSEN * read / size),
             )
+            design = self._design
             return SpeedBudget.chosen(
-                found, self._machine, self._options, self._shaper, self._caution
+                found, self._machine, self._options, design.shaper, design.caution
             )
 
     def _selected(self) -> Iterator[Piece | VerbatimPart]:
@@ -325,11 +309,11 @@ class PipelineRun:
         self.compensated.append(lines)
         self._accept(piece, attempt, delay_s)
 
-    def _accept(self, piece: Piece, attempt: Attempt, delay_s: float) -> None:
+    def _accept(self, piece: Piece, attempt: PieceAttempt, delay_s: float) -> None:
         """Write and measure a piece as attempted; `delay_s` was the delay before it."""
         self._verbatim_before = None
         self._restarts_written.after([piece])
-        self._designed.compensator.commit()
+        self._piece_compensator.compensator.commit()
         # The last sample of an item is the first one of the next.
         written = part_of(attempt.motion, 0, len(attempt.motion) - 1)
         self._verifier.observe(written.executed_mm)
@@ -359,7 +343,7 @@ class PipelineRun:
         self._sum.time_s += restart_s
         return seconds + restart_s
 
-    def _attempt(self, piece: Piece, paced: Piece) -> Attempt:
+    def _attempt(self, piece: Piece, paced: Piece) -> PieceAttempt:
         """Compensate and write a piece at a pace and read it back; or leave everything as it was.
 
         Parameters
@@ -370,7 +354,7 @@ class PipelineRun:
         writer, checker = self._writer.snapshot(), None
         try:
             with self._clock.stage("compensate"):
-                made = self._designed.compensate(paced, self._point)
+                made = self._piece_compensator.compensate(paced, self._point)
             with self._clock.stage("write"):
                 extruder_mm = self._checker.extruder_mm
                 lead = self._writer.leading(piece, extruder_mm) if piece.after_mark else b""
@@ -395,7 +379,7 @@ class PipelineRun:
                 f"line {int(piece.moves.line[0])}: internal error ({type(error).__name__}: "
                 f"{error}); please report it with the file"
             ) from error
-        return Attempt(made, executed, gap_mm, text, motion)
+        return PieceAttempt(made, executed, gap_mm, text, motion)
 
     def _put_back(self, piece: Piece, reason: str) -> None:
         """Write a piece as sliced and undo what was counted for it."""
@@ -494,7 +478,7 @@ class PipelineRun:
             operation=self._operation,
             reader=self._reader,
             writer=self._writer if self._changes else None,
-            shaper=self._shaper,
-            choice=self._choice,
+            shaper=self._design.shaper,
+            choice=self._design.mixture,
             budget=budget,
         )

@@ -13,13 +13,13 @@ from stillpath.models.machine import Machine
 from stillpath.pipeline.caution import Mixture
 from stillpath.pipeline.caution_notes import prediction_note, stated_note
 from stillpath.pipeline.clock import StageClock
+from stillpath.pipeline.file_dialect import skipped_notes, skipped_warnings
 from stillpath.pipeline.measuring.measure import Measurement
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.pipeline.operating_point import Operation
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.pacing.budget import SpeedBudget
 from stillpath.pipeline.pacing.budget_measure import BudgetMeasurement
-from stillpath.pipeline.reading import passed_over, perhaps_passed_over
 from stillpath.pipeline.result import Channel, Result
 from stillpath.pipeline.selection import Selection
 from stillpath.pipeline.totals import Totals
@@ -116,7 +116,7 @@ class Summary:
         if typed is not None:
             yield typed
         yield from self.totals.warnings
-        yield from passed_over(self.reader)
+        yield from skipped_warnings(self.reader)
         yield from self.measurement.warnings()
         if self.writer is not None:
             yield from self.writer.shaper_warnings()
@@ -130,7 +130,7 @@ class Summary:
         if self.choice is not None and any(self.choice.shares):
             yield prediction_note(self.machine, self.choice)
         yield from self.operation.notes()
-        yield from perhaps_passed_over(self.reader)
+        yield from skipped_notes(self.reader)
         if self.writer is not None:
             yield from self._macro_with_limits()
             yield from self._no_shaper()

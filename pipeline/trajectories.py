@@ -15,7 +15,7 @@ import numpy as np
 
 from stillpath.gcode.errors import GcodeError
 from stillpath.models.machine import Machine
-from stillpath.pipeline.columns import Table, csv_table, npz_table
+from stillpath.pipeline.columns import TableWriter, csv_table, npz_table
 from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.live_printing import simulate_live
 from stillpath.pipeline.measuring.tracing import Trace
@@ -127,7 +127,7 @@ class _Window:
     """Writes the samples between two times; `end_s` is the end of the motion so far."""
 
     def __init__(
-        self, table: Table, names: tuple[str, ...], start_s: float, stop_s: float | None
+        self, table: TableWriter, names: tuple[str, ...], start_s: float, stop_s: float | None
     ) -> None:
         self._table, self._names = table, names
         self._first = round(np.ceil(start_s / DT_S - 1e-6))
@@ -175,7 +175,7 @@ class _Passed(Exception):
 
 
 @contextlib.contextmanager
-def _table(target: Path, form: str, names: tuple[str, ...]) -> Iterator[Table]:
+def _table(target: Path, form: str, names: tuple[str, ...]) -> Iterator[TableWriter]:
     lengths = ["x_mm", "y_mm", "z_mm"]
     if "after" in names:
         lengths += ["after_x_mm", "after_y_mm"]

@@ -57,7 +57,7 @@ class Verifier:
 
         Parameters
         ----------
-        gap_mm : ndarray
+        gap_mm : ndarray, shape (n,)
             Distance from the command (`pipeline.piece_compensator.deviation`).
 
         Raises

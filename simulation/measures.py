@@ -61,7 +61,7 @@ class Tally:
         return float(np.sqrt(self.square_sum / self.count)) if self.count else 0.0
 
     def add(self, values: Array, use: Mask | None = None) -> None:
-        """Add the values (those where `use` is true)."""
+        """Add the values, shape (n,) (those where `use` is true)."""
         chosen = values if use is None else values[use]
         if len(chosen):
             self.square_sum += float(chosen @ chosen)

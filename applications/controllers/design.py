@@ -77,10 +77,10 @@ def design_controller(spec: LoopSpec, options: ControllerOptions) -> Designed:
     disturbance, enters = disturbance_of(options, loops[0])
     controller: Controller
     if isinstance(options, AdaptiveOptions):
-        controller, trace = adapted(loops, options, disturbance, enters)
+        controller, retuned = adapted(loops, options, disturbance, enters)
     else:
-        controller, trace = _DESIGNS[type(options)](loops, options, spec), None
-    time = time_figures(spec, loops, controller, options, disturbance, enters, trace)
+        controller, retuned = _DESIGNS[type(options)](loops, options, spec), None
+    time = time_figures(spec, loops, controller, options, disturbance, enters, retuned)
     p = controller.prediction
     return Designed(
         controller,

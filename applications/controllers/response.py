@@ -44,7 +44,7 @@ from stillpath.models.loops import Loop, LoopSpec
 from stillpath.simulation.closed_loop import ClosedLoop, simulate
 
 __all__ = [
-    "Trace",
+    "RetunedRun",
     "adapted",
     "answer",
     "disturbance_of",
@@ -69,8 +69,14 @@ _LARGEST_SIZE = 1e9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Trace:
-    """Output without and with an add-on that was retuned during the run."""
+class RetunedRun:
+    """A run during which the add-on was retuned.
+
+    Attributes
+    ----------
+    d, after : ndarray, shape (n,)
+        The disturbance, and the output with the add-on, at the loop's rate.
+    """
 
     d: Array
     after: Array
@@ -123,7 +129,7 @@ def answer(
 
 def adapted(
     loops: Sequence[Loop], options: AdaptiveOptions, disturbance: DisturbanceSpec, enters: str
-) -> tuple[Controller, Trace]:
+) -> tuple[Controller, RetunedRun]:
     """Run an adaptive observer through the disturbance; return its last controller and the run.
 
     Raises
@@ -156,7 +162,7 @@ def adapted(
             bandwidth_hz=options.bandwidth_hz,
             uncertainty=options.uncertainty,
         )
-    return controller, Trace(d, y)
+    return controller, RetunedRun(d, y)
 
 
 def time_figures(
@@ -166,7 +172,7 @@ def time_figures(
     options: ControllerOptions,
     disturbance: DisturbanceSpec,
     enters: str,
-    trace: Trace | None,
+    retuned: RetunedRun | None,
 ) -> TimeFigures:
     """Simulate the nominal loop and its members, without and with the controller.
 
@@ -179,7 +185,7 @@ def time_figures(
     """
     nominal = loops[0]
     every = round(nominal.dt_s / controller.dt_s)
-    if trace is None:
+    if retuned is None:
         _check(disturbance)
         settled = settling_ticks(max(controller.spectral_radii)) / every
         periods = _PERIODS_SHOWN / (min(_frequencies(disturbance), default=math.inf) * nominal.dt_s)
@@ -188,14 +194,14 @@ def time_figures(
         samples = _samples(options.duration_s, nominal.dt_s, needed, ticks)
         d = sample(disturbance, samples, nominal.dt_s, np.random.default_rng(_SEED))
     else:
-        d = trace.d
+        d = retuned.d
     before = [answer(loop, (), d, enters, sensor=spec.sensor)["y"] for loop in loops]
     watch = ("y", "dhat", "dslow") if isinstance(options, MmpOptions) else ("y",)
     runs = [
         answer(loop, controller.blocks, d, enters, every=every, sensor=spec.sensor, watch=watch)
         for loop in loops
     ]
-    shown = runs[0]["y"] if trace is None else trace.after
+    shown = runs[0]["y"] if retuned is None else retuned.after
     end = _last_periods(disturbance, nominal.dt_s, len(d))
     return TimeFigures(
         disturbance=disturbance_text(disturbance),

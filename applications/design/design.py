@@ -28,7 +28,7 @@ from stillpath.applications.design.figures import (
     RungFigures,
     ZeroFigures,
 )
-from stillpath.applications.design.robustness import Trial
+from stillpath.applications.design.robustness import OffDesignTrial
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.basis import BASES, ZERO
 from stillpath.compensation.defaults import DEFAULT_BASIS
@@ -94,7 +94,7 @@ def design_report(
         For an unknown axis, basis or robust mode; why a design is refused stands in the report.
     """
     made = _designed(machine, axis, basis, robust)
-    trial = Trial(machine, axis, _DT_S, motion, errors_percent)
+    trial = OffDesignTrial(machine, axis, _DT_S, motion, errors_percent)
     missing = [*made.missing, *trial.notes]
     own = _own_curves(trial, made.by_mode, made.ladder, missing)
     if tuned is None:
@@ -214,7 +214,7 @@ def _designers(machine: Machine, basis: str) -> tuple[dict[str, PreviewFbf], lis
 
 
 def _own_curves(
-    trial: Trial,
+    trial: OffDesignTrial,
     designers: Mapping[str, PreviewFbf],
     ladder: Sequence[RungFigures],
     missing: list[str],

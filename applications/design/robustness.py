@@ -23,7 +23,7 @@ from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.simulation.measures import Tally, contour_error
 from stillpath.simulation.response import response
 
-__all__ = ["STAND_S", "Trial"]
+__all__ = ["STAND_S", "OffDesignTrial"]
 
 STAND_S = 0.12
 """Standstill before and after the motion: centred shapers begin early and end late."""
@@ -31,7 +31,7 @@ _STRIDE = 2
 _NO_RESTS = np.zeros((0, 2), np.int64)
 
 
-class Trial:
+class OffDesignTrial:
     """One motion on a machine, one of whose axes may differ from the design.
 
     Parameters

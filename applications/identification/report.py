@@ -20,7 +20,7 @@ from stillpath.applications.identification.figures import (
 from stillpath.applications.machines.resonances import resonances
 from stillpath.models.arrays import Array
 from stillpath.models.identification.prediction import predicted_psd, predicted_spectrum
-from stillpath.models.identification.readers import ReadSettings, direction_of, excitation_for
+from stillpath.models.identification.readers import ReadSettings, assumed_test, direction_of
 from stillpath.models.identification.sets import measured_modes
 from stillpath.models.identification.shaper_choice import choose_shaper, choose_shaper_of
 from stillpath.models.identification.spectrum_model import driven_column
@@ -149,7 +149,7 @@ def _response(measured: FrequencyResponse, fit: Fit) -> ResponseFigures:
 
 
 def _spectrum(measured: Spectrum, fit: Fit, settings: ReadSettings) -> SpectrumFigures:
-    test = excitation_for(measured, settings)
+    test = assumed_test(measured, settings).excitation
     column = settings.sensor_axis or driven_column(measured, test.f_start_hz)
     f, seen, predicted = predicted_psd(measured, column, test, fit)
     return SpectrumFigures(

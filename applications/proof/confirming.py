@@ -19,7 +19,7 @@ from stillpath.applications.proof.matching import read_log
 from stillpath.applications.proof.ring_figures import AxisRing, Half, RingReport, Verdict
 from stillpath.applications.proof.ring_log import (
     AxisLog,
-    Band,
+    FrequencyBand,
     Power,
     floor,
     joined,
@@ -407,7 +407,7 @@ def _late(axis: AxisRing, apart_ms: float) -> AxisRing:
     )
 
 
-def _band(plants: PlantSetSpec) -> Band:
+def _band(plants: PlantSetSpec) -> FrequencyBand:
     """Return the band of all modes of a set that ring."""
     modes = np.concatenate(
         [discretise(m.plant, 1.0 / RATE_HZ).modes() for m in plants.weighted_members()]
@@ -416,7 +416,7 @@ def _band(plants: PlantSetSpec) -> Band:
     if len(rings) == 0:
         rings = modes[:, 0] if len(modes) else np.array([_HIGHEST_HZ])
     high_hz = min(1.4 * float(rings.max()), _HIGHEST_HZ)
-    return Band(min(0.7 * float(rings.min()), 0.5 * high_hz), high_hz)
+    return FrequencyBand(min(0.7 * float(rings.min()), 0.5 * high_hz), high_hz)
 
 
 def _level(stops: Array, noise: Array, kinds: list[int]) -> _Level:

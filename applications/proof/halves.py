@@ -154,7 +154,7 @@ class ProofPrint:
     warnings: list[str]
 
 
-class Written(Protocol):
+class HasText(Protocol):
     """Anything that can be written as lines."""
 
     def text(self) -> str:
@@ -162,7 +162,7 @@ class Written(Protocol):
 
 
 def write_proof(
-    program: Written,
+    program: HasText,
     machine: Machine,
     target: Path,
     legend: Callable[[dict[str, Ringing], Result], list[str]],

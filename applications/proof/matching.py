@@ -88,7 +88,7 @@ class Match:
 
 
 def band_pass(signal: Array, dt_s: float, low_hz: float, high_hz: float) -> Array:
-    """Return rows within a band, without delay (Butterworth, forwards and backwards)."""
+    """Return rows, shape (..., n), within a band, without delay (Butterworth, there and back)."""
     nyquist = 0.5 / dt_s
     sos = butter(3, [low_hz / nyquist, min(high_hz / nyquist, 0.95)], "band", output="sos")
     return np.asarray(sosfiltfilt(sos, signal, axis=-1))

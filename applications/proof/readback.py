@@ -27,9 +27,9 @@ from stillpath.models.machine import Machine
 from stillpath.models.plants import PlantSpec, discretise
 from stillpath.models.schedule import EMPTY
 from stillpath.models.shaping import OFF
+from stillpath.pipeline.file_dialect import dialect_for
 from stillpath.pipeline.file_motion import TextMotion
 from stillpath.pipeline.progress import ProgressCallback, ProgressReports
-from stillpath.pipeline.reading import dialect_for
 from stillpath.pipeline.shaping import ShapedMotion
 from stillpath.simulation.response import PlantStream
 from stillpath.version import __version__

@@ -22,7 +22,7 @@ from stillpath.models.identification.types import AccelerationLog
 
 __all__ = [
     "AxisLog",
-    "Band",
+    "FrequencyBand",
     "Power",
     "floor",
     "joined",
@@ -51,7 +51,7 @@ _LAG_SAMPLES = 20
 
 
 @dataclass(frozen=True, slots=True)
-class Band:
+class FrequencyBand:
     """Frequency band of the evaluated vibration."""
 
     low_hz: float
@@ -163,13 +163,13 @@ def read_axis(
     )
 
 
-def residual(accel: Array, stops: Sequence[Stop], band: Band) -> Power:
-    """Return the vibration in a band after each stop."""
+def residual(accel: Array, stops: Sequence[Stop], band: FrequencyBand) -> Power:
+    """Return the vibration in a band after each stop; `accel`, (n,), is in mm/s^2 at `RATE_HZ`."""
     return _power(accel, [stop.at_s + WINDOW_S[0] for stop in stops], band)
 
 
-def floor(log: AxisLog, motion: RingMotion, band: Band) -> Power:
-    """Return the same before the first move: vibration that the machine does not cause."""
+def floor(log: AxisLog, motion: RingMotion, band: FrequencyBand) -> Power:
+    """Return the vibration before the first move, which the machine does not cause."""
     length_s = WINDOW_S[1] - WINDOW_S[0]
     starts = [
         start
@@ -185,11 +185,16 @@ def joined(parts: Sequence[Power]) -> Power:
     return Power(np.concatenate([p.accel for p in parts]), np.concatenate([p.way for p in parts]))
 
 
-def misses(log: AxisLog, motion: RingMotion, predicted: Array, band: Band) -> float:
+def misses(log: AxisLog, motion: RingMotion, predicted: Array, band: FrequencyBand) -> float:
     """Return how much of the motion a prediction misses, 0 to 1 and above.
 
     The rms of measured minus predicted acceleration over that of the measured one, gain and lag of
     the sensor fitted, its noise floor taken off both.
+
+    Parameters
+    ----------
+    predicted : ndarray, shape (n,)
+        Acceleration along the log's axis, mm/s^2 at `RATE_HZ`, as long as the log.
     """
     own = np.flatnonzero(motion.about[log.axis] & log.inside)
     at = np.arange(len(predicted))
@@ -201,13 +206,13 @@ def misses(log: AxisLog, motion: RingMotion, predicted: Array, band: Band) -> fl
     kept = np.searchsorted(np.flatnonzero(log.inside), own)
     m, p = m[kept], p[kept]
     rest = m - p * float(m @ p) / max(float(p @ p), 1e-12)
-    noise = float(floor(log, motion, Band(_LOWEST_HZ, band.high_hz)).accel.mean())
+    noise = float(floor(log, motion, FrequencyBand(_LOWEST_HZ, band.high_hz)).accel.mean())
     missed, whole = (float(np.mean(x**2)) - noise for x in (rest, m))
     return float(np.sqrt(max(missed, 0.0) / max(whole, 1e-12)))
 
 
 def lag_s(log: AxisLog, motion: RingMotion, predicted: Array) -> float:
-    """Return the delay of the log relative to a prediction, below the modes."""
+    """Return the delay of the log relative to a prediction (as of `misses`), below the modes."""
     m, p = (band_pass(x, 1.0 / RATE_HZ, *_LAG_BAND_HZ) for x in (log.measured, predicted))
     kept = motion.about[log.axis] & log.inside
     shifts = np.arange(-_LAG_SAMPLES, _LAG_SAMPLES + 1)
@@ -224,7 +229,7 @@ def _rows(start_s: float, length_s: float) -> slice:
     return slice(first, first + round(length_s * RATE_HZ))
 
 
-def _power(accel: Array, starts_s: Sequence[float], band: Band) -> Power:
+def _power(accel: Array, starts_s: Sequence[float], band: FrequencyBand) -> Power:
     n = round((WINDOW_S[1] - WINDOW_S[0]) * RATE_HZ)
     window = tukey(n, _TAPER)
     f = np.fft.rfftfreq(n, 1.0 / RATE_HZ)

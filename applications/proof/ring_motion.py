@@ -27,8 +27,8 @@ from stillpath.models.machine import Machine
 from stillpath.models.plants import PlantSpec, discretise
 from stillpath.models.ripple import MachineRipple
 from stillpath.models.runs import runs
+from stillpath.pipeline.file_dialect import dialect_for
 from stillpath.pipeline.file_motion import TextMotion
-from stillpath.pipeline.reading import dialect_for
 from stillpath.simulation.response import PlantStream
 
 __all__ = ["RingMotion", "Stop", "is_ring_test", "read_ring_motion"]

@@ -20,7 +20,7 @@ from stillpath.models.machine import Machine
 from stillpath.pipeline.progress import ProgressCallback
 from stillpath.pipeline.result import Result
 
-__all__ = ["Band", "Tower", "tower_program", "write_tower"]
+__all__ = ["Tower", "TowerBand", "tower_program", "write_tower"]
 
 Point = tuple[float, float]
 
@@ -32,7 +32,7 @@ _FEWEST, _MOST = 2, 12
 
 
 @dataclass(frozen=True, slots=True)
-class Band:
+class TowerBand:
     """A band of the tower, from the bed up."""
 
     bottom_mm: float
@@ -48,7 +48,7 @@ class Tower:
     """The tower that was written, and its legend in numbers."""
 
     written: ProofPrint
-    bands: list[Band]
+    bands: list[TowerBand]
 
 
 def tower_program(
@@ -112,7 +112,7 @@ def write_tower(
         As of `pipeline.compensate.compensate_file`.
     """
     program, drives = tower_program(machine, axis, settings or PrintSettings(), count)
-    found: list[Band] = []
+    found: list[TowerBand] = []
 
     def legend(ringing: dict[str, Ringing], result: Result) -> list[str]:
         height = round(_BAND_MM / program.layer_mm) * program.layer_mm
@@ -120,14 +120,14 @@ def write_tower(
         for k, chosen in enumerate(drives):
             before, after = (ringing[_band(k) + half] for half in (AS_PLANNED, COMPENSATED))
             low, high = bottom + k * height, bottom + (k + 1) * height
-            found.append(Band(low, high, chosen.accel_mm_s2, chosen.speed_mm_s, before, after))
+            found.append(TowerBand(low, high, chosen.accel_mm_s2, chosen.speed_mm_s, before, after))
         return _legend(machine, axis, found, result)
 
     written = write_proof(program, machine, target, legend, cache_dir=cache_dir, progress=progress)
     return Tower(written, found)
 
 
-def _legend(machine: Machine, axis: Axis, found: list[Band], result: Result) -> list[str]:
+def _legend(machine: Machine, axis: Axis, found: list[TowerBand], result: Result) -> list[str]:
     mode = ringing_mode(machine.axes[axis].nominal)
     where = "the outer side walls" if axis == "x" else "the front walls"
     return [

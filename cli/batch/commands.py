@@ -144,32 +144,32 @@ def _at_work(
     """Yield a worker pool, its output folder, and a check to call now and then."""
     from stillpath.cli.batch.items import check_names
     from stillpath.cli.batch.output import OutputFolder
-    from stillpath.cli.batch.worker_pool import LocalPool, Workplace, worker_pool
+    from stillpath.cli.batch.worker_pool import Backend, LocalBackend, worker_pool
     from stillpath.cli.own_machines import open_machines
     from stillpath.service.interruption import interruptible
 
     check_folder(output, "--output")
-    works: Workplace
+    backend: Backend
     if not asked.server:
         jobs = asked.jobs or os.cpu_count() or 1
         machines = open_machines()
         check_names(group, machines)
-        works = LocalPool(machines, options, jobs)
+        backend = LocalBackend(machines, options, jobs)
     else:
-        from stillpath.cli.batch.server import ServerWorkplace, batch_name
+        from stillpath.cli.batch.server import ServerBackend, batch_name
         from stillpath.service.client import Client, ClientError
 
         jobs = asked.jobs or _AT_A_SERVER
         try:
             client = Client(asked.server, asked.key)
-            works = ServerWorkplace(client, options, batch_name(output))
+            backend = ServerBackend(client, options, batch_name(output))
         except ClientError as error:
             sys.stderr.write(f"stillpath: error: {error}\n")
             raise SystemExit(error.exit_code) from None
     with (
         interruptible() as check,
         OutputFolder.opened(output) as folder,
-        worker_pool(works, folder, options, jobs) as made,
+        worker_pool(backend, folder, options, jobs) as made,
     ):
         yield made, folder, check
 

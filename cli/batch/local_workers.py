@@ -22,14 +22,14 @@ if TYPE_CHECKING:
     from stillpath.models.machine import Machine
     from stillpath.pipeline.options import Options
 
-__all__ = ["Failure", "LocalWorker", "Made", "Stopped", "Task", "failure_of"]
+__all__ = ["Failure", "FileResult", "FileTask", "LocalWorker", "Stopped", "failure_of"]
 
 _POLL_S = 0.2
 _END_S = 5.0
 
 
 @dataclass(frozen=True, slots=True)
-class Task:
+class FileTask:
     """What a process is to do; `result` and the folder `report` are made by it."""
 
     source: Path
@@ -41,7 +41,7 @@ class Task:
 
 
 @dataclass(frozen=True, slots=True)
-class Made:
+class FileResult:
     """What it found, and the seconds of its processor."""
 
     figures: Figures
@@ -70,7 +70,7 @@ class LocalWorker:
         self._process: BaseProcess | None = None
         self._connection: Connection | None = None
 
-    def do(self, task: Task, stopping: threading.Event) -> Made:
+    def do(self, task: FileTask, stopping: threading.Event) -> FileResult:
         """Do one file.
 
         Raises
@@ -98,7 +98,7 @@ class LocalWorker:
             ) from None
         if isinstance(answer, Failure):
             raise answer
-        assert isinstance(answer, Made)
+        assert isinstance(answer, FileResult)
         return answer
 
     def end(self) -> None:
@@ -159,7 +159,7 @@ def failure_of(error: Exception) -> Failure:
             return Failure(f"an error of the program: {type(error).__name__}: {error}", "computer")
 
 
-def compensate(task: Task) -> Made:
+def compensate(task: FileTask) -> FileResult:
     """Do one file in this process.
 
     Raises
@@ -183,10 +183,10 @@ def compensate(task: Task) -> Made:
         put_back=len(result.put_back),
         warnings=result.warnings,
     )
-    return Made(figures, time.process_time() - began)
+    return FileResult(figures, time.process_time() - began)
 
 
-def _serve(connection: Connection, work: Callable[[Task], Made] = compensate) -> None:
+def _serve(connection: Connection, work: Callable[[FileTask], FileResult] = compensate) -> None:
     """Serve tasks until the pipe is closed. The entry point of the process."""
     from stillpath.service.environment import prepare_environment
 
@@ -200,7 +200,7 @@ def _serve(connection: Connection, work: Callable[[Task], Made] = compensate) ->
         except (EOFError, ConnectionResetError):
             return
         try:
-            answer: Made | Failure = work(task)
+            answer: FileResult | Failure = work(task)
         except Exception as error:
             answer = failure_of(error)
         try:

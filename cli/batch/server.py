@@ -8,7 +8,7 @@ import threading
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stillpath.cli.batch.local_workers import Failure, Made, Stopped
+from stillpath.cli.batch.local_workers import Failure, FileResult, Stopped
 from stillpath.cli.batch.output import Figures, Scratch, Trouble
 from stillpath.cli.batch.worker_pool import Found
 from stillpath.service.client import Client, ClientError
@@ -18,13 +18,13 @@ if TYPE_CHECKING:
     from stillpath.pipeline.options import Options
     from stillpath.service.api.schemas import JobView
 
-__all__ = ["ServerWorkplace", "batch_name"]
+__all__ = ["ServerBackend", "batch_name"]
 
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.3, 2.0
 _OF_REQUEST = (400, 401, 403, 422)
 
 
-class ServerWorkplace:
+class ServerBackend:
     """Compensates on a server. A job that was begun goes on there when we are interrupted.
 
     Parameters
@@ -46,7 +46,7 @@ class ServerWorkplace:
             raise
 
     def machine(self, name: str) -> Found:
-        """See `Workplace`. What the server would use depends on approvals; they count as well."""
+        """See `Backend`. What the server would use depends on approvals; they count as well."""
         try:
             machines = self._client.machines()
         except ClientError as error:
@@ -57,8 +57,10 @@ class ServerWorkplace:
                 return Found(name, "/".join(str(part) for part in stand if part is not None))
         raise Failure(f"{self._client.server} has no machine {name}", "machine")
 
-    def do(self, source: Path, scratch: Scratch, machine: Found, stopping: threading.Event) -> Made:
-        """See `Workplace`."""
+    def do(
+        self, source: Path, scratch: Scratch, machine: Found, stopping: threading.Event
+    ) -> FileResult:
+        """See `Backend`."""
 
         def tell(*_: object) -> None:
             if stopping.is_set():
@@ -81,10 +83,10 @@ class ServerWorkplace:
             raise _failure_of(error) from None
         report = json.loads((scratch.report / "report.json").read_bytes())
         figures = {**(job.summary or {}), "warnings": report.get("warnings", [])}
-        return Made(Figures.model_validate(figures), 0.0)
+        return FileResult(Figures.model_validate(figures), 0.0)
 
     def close(self) -> None:
-        """See `Workplace`."""
+        """See `Backend`."""
         self._client.close()
 
 

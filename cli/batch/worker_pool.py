@@ -15,7 +15,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from stillpath.cli.batch.items import Item
-from stillpath.cli.batch.local_workers import Failure, LocalWorker, Made, Stopped, Task, failure_of
+from stillpath.cli.batch.local_workers import (
+    Failure,
+    FileResult,
+    FileTask,
+    LocalWorker,
+    Stopped,
+    failure_of,
+)
 from stillpath.cli.batch.output import Outcome, OutputFolder, Scratch, sha256_of
 from stillpath.version import build
 
@@ -23,19 +30,19 @@ if TYPE_CHECKING:
     from stillpath.applications.machines.resolve import PinnedMachine, Resolver
     from stillpath.pipeline.options import Options
 
-__all__ = ["Found", "IsFinished", "LocalPool", "WorkerPool", "Workplace", "worker_pool"]
+__all__ = ["Backend", "Found", "IsFinished", "LocalBackend", "WorkerPool", "worker_pool"]
 
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """A machine as the works know it: its own name, and the digest of its document."""
+    """A machine as a backend knows it: its own name, and the digest of its document."""
 
     name: str
     revision: str
     pinned: PinnedMachine | None = None
 
 
-class Workplace(Protocol):
+class Backend(Protocol):
     """Where files are compensated."""
 
     @property
@@ -51,7 +58,9 @@ class Workplace(Protocol):
             If there is no such machine, or it is not approved.
         """
 
-    def do(self, source: Path, scratch: Scratch, machine: Found, stopping: threading.Event) -> Made:
+    def do(
+        self, source: Path, scratch: Scratch, machine: Found, stopping: threading.Event
+    ) -> FileResult:
         """Make result and report in `scratch`.
 
         Raises
@@ -63,7 +72,7 @@ class Workplace(Protocol):
         """End what was started."""
 
 
-class LocalPool:
+class LocalBackend:
     """Compensates in processes of this computer.
 
     Parameters
@@ -82,15 +91,17 @@ class LocalPool:
             self._free.put(worker)
 
     def machine(self, name: str) -> Found:
-        """See `Workplace`."""
+        """See `Backend`."""
         found = self._machines.for_job(name, files=True)
         return Found(found.machine.name, found.machine.revision, found)
 
-    def do(self, source: Path, scratch: Scratch, machine: Found, stopping: threading.Event) -> Made:
-        """See `Workplace`."""
+    def do(
+        self, source: Path, scratch: Scratch, machine: Found, stopping: threading.Event
+    ) -> FileResult:
+        """See `Backend`."""
         pinned = machine.pinned
         assert pinned is not None
-        task = Task(
+        task = FileTask(
             source, scratch.result, scratch.report, pinned.machine, self._options, pinned.warnings
         )
         worker = self._free.get()
@@ -100,7 +111,7 @@ class LocalPool:
             self._free.put(worker)
 
     def close(self) -> None:
-        """See `Workplace`."""
+        """See `Backend`."""
         for worker in self._workers:
             worker.end()
 
@@ -112,8 +123,8 @@ IsFinished = Callable[[Item, Outcome, Outcome], bool]
 class WorkerPool:
     """Does items in threads; each waits for a process of this computer or for a server."""
 
-    def __init__(self, works: Workplace, output: OutputFolder, options: Options, jobs: int) -> None:
-        self._works = works
+    def __init__(self, backend: Backend, output: OutputFolder, options: Options, jobs: int) -> None:
+        self._backend = backend
         self._output = output
         self._options = options.model_dump_json()
         self._stopping = threading.Event()
@@ -127,7 +138,7 @@ class WorkerPool:
         """Break off what is being done, begin nothing new, and wait until it is quiet."""
         self._stopping.set()
         self._threads.shutdown(cancel_futures=True)
-        self._works.close()
+        self._backend.close()
 
     def _do(self, item: Item, is_done: IsFinished) -> Outcome:
         if self._stopping.is_set():
@@ -163,16 +174,16 @@ class WorkerPool:
                 "no pattern of --machine-map fits, and there is no --machine for the rest",
                 "machine",
             )
-        machine = self._works.machine(item.machine)
+        machine = self._backend.machine(item.machine)
         digest = sha256_of(item.source)
         return machine, Outcome(
             state="failed",
             source=str(item.source),
             machine=machine.name,
             machine_revision=machine.revision,
-            version=self._works.version,
+            version=self._backend.version,
             source_sha256=digest,
-            key=_key(digest, machine.revision, self._options, self._works.version),
+            key=_key(digest, machine.revision, self._options, self._backend.version),
             output=item.output(machine.name),
             report=item.report(machine.name),
         )
@@ -185,7 +196,7 @@ class WorkerPool:
         began = _signature(item.source)
         scratch = self._output.scratch(outcome.output)
         try:
-            made = self._works.do(item.source, scratch, machine, self._stopping)
+            made = self._backend.do(item.source, scratch, machine, self._stopping)
             if _signature(item.source) != began or sha256_of(item.source) != outcome.source_sha256:
                 raise Failure("it was changed while it was read; submit it again", "computer")
             done = outcome.model_copy(
@@ -205,10 +216,10 @@ class WorkerPool:
 
 @contextmanager
 def worker_pool(
-    works: Workplace, output: OutputFolder, options: Options, jobs: int
+    backend: Backend, output: OutputFolder, options: Options, jobs: int
 ) -> Iterator[WorkerPool]:
     """Yield a worker pool that is quiet when the block ends."""
-    made = WorkerPool(works, output, options, jobs)
+    made = WorkerPool(backend, output, options, jobs)
     try:
         yield made
     finally:

@@ -101,7 +101,7 @@ def design_disturbance_observer(
 
 
 def binomial_q(cutoff_hz: float, dt_s: float) -> tuple[Array, Array]:
-    """Return the bilinear transform of Q = (3 tau s + 1) / (tau s + 1)^3, powers of z^-1.
+    """Return Q = (3 tau s + 1) / (tau s + 1)^3 by the bilinear transform: num, den in z^-1.
 
     Raises
     ------

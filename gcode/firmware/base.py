@@ -85,7 +85,7 @@ class Encoder(Protocol):
         """Step of the extruder's speed, from a change of filament per mm, that costs no time."""
 
     def rest_durations(self, piece: Piece, groups: Sequence[Group]) -> NDArray[np.float64]:
-        """Return a first estimate of the duration of each rest between stretches."""
+        """Return a first estimate of how long each rest takes [s], shape (len(groups),)."""
 
     def encode(self, piece: Piece, timeline: Timeline, segments: Segments) -> Encoded:
         """Choose rounded positions and feedrates.

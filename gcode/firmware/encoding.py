@@ -246,7 +246,7 @@ def lateness_s(
 
 
 def group_durations(phases: Phases, groups: Sequence[Group]) -> NDArray[np.float64]:
-    """Return how long each group takes; `phases` has a row for every row of the piece."""
+    """Return how long each group takes [s]; `phases` has a row for every row of the piece."""
     lasts_s = phases.lasts_s
     return np.array([lasts_s[g.first : g.last].sum() for g in groups])
 

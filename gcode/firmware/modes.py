@@ -30,7 +30,7 @@ class WrittenModes:
 
 
 def event_places(piece: Piece, encoded: Encoded) -> NDArray[np.int64]:
-    """Return the index of the written move before which each event is written."""
+    """Return the index of the written move before which each event is written, shape (events,)."""
     first = np.full(len(piece.moves) + 1, len(encoded.row), np.int64)
     # The move that begins nearest to the moment; the encoder's times are slightly off the plan.
     between_s = 0.5 * (encoded.start_s[1:] + encoded.start_s[:-1])

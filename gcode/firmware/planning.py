@@ -39,7 +39,7 @@ _STOPS = np.array([kind in STOPPING for kind in EventKind])
 
 
 def stops(events: Events) -> NDArray[np.bool_]:
-    """Mark events at which the motion comes to rest."""
+    """Mark events at which the motion comes to rest, shape (len(events),)."""
     return np.asarray(_STOPS[events.kind])
 
 

@@ -17,12 +17,12 @@ from scipy.interpolate import CubicSpline
 
 from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
-from stillpath.models.identification.excitation import VelocityProfile, klipper_psd, regenerate
+from stillpath.models.identification.excitation import VelocityProfile, regenerate
 from stillpath.models.identification.strength import strength
-from stillpath.models.identification.types import AccelerationLog, Excitation, Spectrum
+from stillpath.models.identification.types import AccelerationLog, Excitation
 from stillpath.models.notes import WarningNote
 
-__all__ = ["AlignedLog", "align", "check_pair", "resample", "spectrum_along"]
+__all__ = ["AlignedLog", "align", "check_pair", "resample"]
 
 _BAND_HZ = 10.0
 _LEAST_CORRELATION = 0.6
@@ -34,7 +34,6 @@ _EARLIER_S, _FOLLOWS, _LEAST_LEVEL = 0.5, 0.6, 0.3  # of a test that began at a 
 _LATEST_START_S = 0.6  # half a second, plus delays of sensor, plant and time stamps
 _LEAD_S = 0.5
 _UNSURE_S = 0.01  # of a start, where friction and a frame delay slow motion
-_TABLE_HZ = 200.0  # where Klipper ends a table
 _CROSS = 0.2  # of the power along the axis
 _AS_LONG_S = 2e-3  # the kinds of a test differ by 11 ms from 10 Hz on, by 21 ms from 5 Hz on
 _PHASES_HZ, _EVERY_HZ, _LATE_S = 16.0, 0.5, 0.02  # where phases are compared, and how
@@ -85,14 +84,6 @@ class _Placed:
     command: Array
     vector: Array
     correlation: float
-
-
-def spectrum_along(aligned: AlignedLog, log: AccelerationLog, column: str) -> Spectrum:
-    """Return the spectrum of an aligned log along its axis, as Klipper computes tables."""
-    time_s = np.arange(len(aligned.measured_mm_s2)) / aligned.rate_hz
-    f_hz, psd = klipper_psd(time_s, aligned.measured_mm_s2)
-    told = f_hz <= _TABLE_HZ
-    return Spectrum(f_hz[told], {column: psd[told]}, axis=log.axis, source=log.source)
 
 
 def align(

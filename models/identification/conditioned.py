@@ -47,11 +47,12 @@ _REPEATABLE = 0.0035
 
 
 class SpectrumRun(NamedTuple):
-    """A spectrum, the test that made it, and under what condition."""
+    """A spectrum, the test that made it, under what condition, and notes on what was assumed."""
 
     spectrum: Spectrum
     test: Excitation
     condition: Condition
+    notes: tuple[str, ...] = ()
 
 
 def usual(conditions: Sequence[Condition], axis: str) -> list[Condition]:

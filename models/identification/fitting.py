@@ -24,7 +24,7 @@ from stillpath.models.identification.mode_estimates import (
 )
 from stillpath.models.identification.pair_structure import PairStructure
 from stillpath.models.identification.response_candidate import (
-    Candidate,
+    ResponseCandidate,
     delay_span,
     judged,
     least_error,
@@ -136,7 +136,7 @@ def refit_response(measured: FrequencyResponse, like: Fit) -> Fit:
     return replace(_as_fit(data, fitted), trials=(OrderTrial(structure.poles, fitted.nrmse),))
 
 
-_Candidate: TypeAlias = Candidate[PairStructure]
+_Candidate: TypeAlias = ResponseCandidate[PairStructure]
 
 
 def _best_of_order(data: ResponseData, order: int, smaller: _Candidate | None) -> _Candidate:
@@ -320,7 +320,7 @@ def _grown(data: ResponseData, smaller: _Candidate) -> _Candidate:
     error = np.abs(data.weight * (smaller.model(data.f_hz) - data.response))
     at = data.f_hz[np.argmax(np.convolve(error, np.ones(5) / 5, mode="same"))]
     structure, theta = smaller.structure.extended(smaller.theta, float(at))
-    return Candidate(structure, np.concatenate([smaller.vector[:2], theta]))
+    return ResponseCandidate(structure, np.concatenate([smaller.vector[:2], theta]))
 
 
 def _polished(

@@ -30,7 +30,7 @@ from stillpath.models.identification.local_model import (
     log_residual,
 )
 from stillpath.models.identification.types import FrequencyResponse
-from stillpath.models.plants import MOST_FRICTION_MM
+from stillpath.models.plants import MOST_FRICTION_MM, PlantSetSpec
 
 __all__ = ["Friction", "better_explained", "dry_friction", "freed"]
 
@@ -67,6 +67,10 @@ class Friction:
     held_mm: float = 0.0
     late_s: float = 0.0
     motion: int = 0
+
+    def on(self, plants: PlantSetSpec) -> PlantSetSpec:
+        """Return plants of the axis with its friction, where there is any."""
+        return plants.with_friction(self.held_mm) if self.held_mm else plants
 
 
 def dry_friction(

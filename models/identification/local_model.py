@@ -108,7 +108,7 @@ def bins_needed(records: int, *, transient: bool) -> int:
 
 
 def log_residual(coherence: Array) -> Array:
-    """Return the logarithm of the share of the power that a response leaves unexplained."""
+    """Return the logarithm of the share of the power that a response leaves unexplained, (n,)."""
     return np.asarray(np.log(np.maximum(1.0 - coherence, 1e-9)), np.float64)
 
 

@@ -26,7 +26,7 @@ from stillpath.models.identification.mode_estimates import (
 )
 from stillpath.models.identification.prompt import delay_of, prompt
 from stillpath.models.identification.response_candidate import (
-    Candidate,
+    ResponseCandidate,
     delay_span,
     judged,
     least_error,
@@ -45,7 +45,7 @@ from stillpath.models.plants import PairsSpec, RelativeModesSpec, frequency_resp
 
 __all__ = ["alternatives", "fit_modes", "of_poles", "refit"]
 
-Modal: TypeAlias = Candidate[ModalStructure]
+Modal: TypeAlias = ResponseCandidate[ModalStructure]
 
 _AS_GOOD, _EXPLAINED, _IRRELEVANT = 1.05, 1.3, 0.005
 """A fit is as good as another within 5 % of its residual, within 1.3 times the noise, or within

@@ -21,6 +21,8 @@ def predicted_psd(
 ) -> tuple[Array, Array, Array]:
     """Return frequencies, the measured and the predicted spectrum, without noise, of a column.
 
+    Shapes (n,); densities in (mm/s^2)^2/Hz.
+
     Raises
     ------
     ModelError
@@ -33,7 +35,7 @@ def predicted_psd(
 
 
 def predicted_spectrum(plant: PlantSpec, excitation: Excitation) -> tuple[Array, Array]:
-    """Return frequencies up to 200 Hz and the spectrum that the test would show of a plant."""
+    """Return frequencies up to 200 Hz and the density [(mm/s^2)^2/Hz] that the test would show."""
     f = np.arange(_BIN_HZ, _F_MAX_HZ, _BIN_HZ)
     power = np.abs(frequency_response(plant, f)) ** 2
     return f, np.asarray(drive_spectrum(excitation, f) * power, np.float64)

@@ -5,21 +5,26 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from stillpath.models.errors import ModelError
-from stillpath.models.identification.alignment import AlignedLog, align, spectrum_along
+from stillpath.models.identification.alignment import AlignedLog, align
 from stillpath.models.identification.clocks import Lateness, lateness
 from stillpath.models.identification.conditioned import SpectrumRun
 from stillpath.models.identification.conditions import Condition
 from stillpath.models.identification.estimation import estimate_aligned, estimate_response
+from stillpath.models.identification.excitation import klipper_psd
 from stillpath.models.identification.friction import Friction, better_explained, dry_friction, freed
 from stillpath.models.identification.messages import strength_notes
 from stillpath.models.identification.nozzle import Frame, frame_of
-from stillpath.models.identification.readers import ReadSettings, excitation_for, excitation_notes
-from stillpath.models.identification.types import AccelerationLog, FrequencyResponse
+from stillpath.models.identification.readers import AssumedTest, ReadSettings, assumed_test
+from stillpath.models.identification.types import AccelerationLog, FrequencyResponse, Spectrum
 from stillpath.models.plants import ParametricMembers, PlantSetSpec, PlantSpec
 
 __all__ = ["RawRun", "estimated", "frame_in", "lateness_in", "spectrum_in", "without_friction"]
 
+_TABLE_HZ = 200.0
+"""Where Klipper ends a table."""
 _SENSOR_AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
@@ -33,12 +38,15 @@ class RawRun:
         The part of the log that is the test, beside its command.
     response : FrequencyResponse
         Of the axis, as the sensor felt it.
+    assumed : AssumedTest
+        The test that was looked for.
     """
 
     log: AccelerationLog
     aligned: AlignedLog
     response: FrequencyResponse
     condition: Condition
+    assumed: AssumedTest
 
 
 def estimated(
@@ -60,11 +68,11 @@ def estimated(
         If the test is not in the log, or the axis did not follow it (`align`,
         `estimate_response`); with what the reader noticed, which may be the reason.
     """
-    test = excitation_for(log, settings)
+    assumed = assumed_test(log, settings)
     known = settings.accel_per_hz_mm_s is not None
     mounted = _SENSOR_AXES.get(settings.sensor_axis or "")
     try:
-        aligned = align(log, test, sensor_direction=mounted, is_strength_known=known)
+        aligned = align(log, assumed.excitation, sensor_direction=mounted, is_strength_known=known)
         test = aligned.excitation
         response = estimate_response(
             log,
@@ -76,10 +84,9 @@ def estimated(
         )
     except ModelError as error:
         raise ModelError("; ".join([str(error), *log.notes])) from None
-    assumed = excitation_notes(log, settings)
     levels = () if known else strength_notes(response, test)
-    response = replace(response, notes=(*response.notes, *assumed, *levels))
-    return RawRun(log, aligned, response, condition)
+    response = replace(response, notes=(*response.notes, *assumed.notes, *levels))
+    return RawRun(log, aligned, response, condition, assumed)
 
 
 def frame_in(
@@ -125,11 +132,18 @@ def _freed(run: RawRun, motion: FrequencyResponse, friction: Friction) -> RawRun
     return replace(run, response=response)
 
 
-def spectrum_in(run: RawRun, settings: ReadSettings, column: str) -> SpectrumRun:
-    """Return the spectrum of a log along its axis, in a column of that name."""
-    strength = run.aligned.excitation.accel_per_hz_mm_s
-    test = replace(excitation_for(run.log, settings), accel_per_hz_mm_s=strength)
-    return SpectrumRun(spectrum_along(run.aligned, run.log, column), test, run.condition)
+def spectrum_in(run: RawRun, column: str) -> SpectrumRun:
+    """Return the spectrum of a log along its axis, as Klipper computes tables, in such a column."""
+    aligned = run.aligned
+    strength = aligned.excitation.accel_per_hz_mm_s
+    test = replace(run.assumed.excitation, accel_per_hz_mm_s=strength)
+    time_s = np.arange(len(aligned.measured_mm_s2)) / aligned.rate_hz
+    f_hz, psd = klipper_psd(time_s, aligned.measured_mm_s2)
+    told = f_hz <= _TABLE_HZ
+    psd_of = {column: psd[told]}
+    spectrum = Spectrum(f_hz[told], psd_of, run.log.axis, run.log.source, strength)
+    notes = (*run.assumed.notes, *aligned.notes)
+    return SpectrumRun(spectrum, test, run.condition, notes)
 
 
 def lateness_in(

@@ -11,7 +11,15 @@ from scipy.optimize import least_squares
 from stillpath.models.arrays import Array, Complex
 from stillpath.models.identification.response_data import ResponseData
 
-__all__ = ["GAIN", "Candidate", "Structure", "delay_span", "judged", "least_error", "with_gain"]
+__all__ = [
+    "GAIN",
+    "ResponseCandidate",
+    "Structure",
+    "delay_span",
+    "judged",
+    "least_error",
+    "with_gain",
+]
 
 GAIN = (1e-9, 1e9)
 """Bounds of the gain, wide enough for any two units."""
@@ -36,7 +44,7 @@ S = TypeVar("S", bound=Structure)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Candidate(Generic[S]):
+class ResponseCandidate(Generic[S]):
     """Parameters [log gain, delay (unit 1/(2 pi unit_hz)), theta ...] of a structure."""
 
     structure: S
@@ -66,16 +74,20 @@ class Candidate(Generic[S]):
         return np.asarray(self.model(f_hz)[:, None] * np.column_stack(logs))
 
 
-def with_gain(data: ResponseData, structure: S, theta: Array, delay_s: float) -> Candidate[S]:
+def with_gain(
+    data: ResponseData, structure: S, theta: Array, delay_s: float
+) -> ResponseCandidate[S]:
     """Put gain (by least squares) and delay in front of the parameters of the plant."""
-    raw = Candidate(structure, np.concatenate([[0.0, delay_s * 2 * np.pi * data.unit_hz], theta]))
+    raw = ResponseCandidate(
+        structure, np.concatenate([[0.0, delay_s * 2 * np.pi * data.unit_hz], theta])
+    )
     shape = data.weight * raw.model(data.f_hz)
     gain = float(np.vdot(shape, data.weight * data.response).real / np.vdot(shape, shape).real)
     raw.vector[0] = np.log(max(gain, GAIN[0]))
     return raw
 
 
-def judged(data: ResponseData, candidate: Candidate[S]) -> Candidate[S]:
+def judged(data: ResponseData, candidate: ResponseCandidate[S]) -> ResponseCandidate[S]:
     """Return the candidate with its residual.
 
     Candidates are ranked by the modulus of the error, which no phase of reference changes; the fit
@@ -88,8 +100,8 @@ def judged(data: ResponseData, candidate: Candidate[S]) -> Candidate[S]:
 
 
 def least_error(
-    data: ResponseData, start: Candidate[S], low: Array, high: Array, span: float
-) -> Candidate[S]:
+    data: ResponseData, start: ResponseCandidate[S], low: Array, high: Array, span: float
+) -> ResponseCandidate[S]:
     """Minimise the weighted error, outliers softened.
 
     Parameters

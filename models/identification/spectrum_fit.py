@@ -37,7 +37,7 @@ from stillpath.models.identification.spectrum_model import (
     cross_axis_share,
     driven_column,
 )
-from stillpath.models.identification.spectrum_search import Candidate, Search, whitening_of
+from stillpath.models.identification.spectrum_search import Search, SpectrumCandidate, whitening_of
 from stillpath.models.identification.types import (
     Excitation,
     Fit,
@@ -85,12 +85,12 @@ class Explanations:
     excitation: Excitation
     column: str
     search: Search
-    found: tuple[Candidate, ...]
+    found: tuple[SpectrumCandidate, ...]
     """From many starts, the best first."""
-    accepted: tuple[Candidate, ...]
-    likeliest: tuple[Candidate, ...]
+    accepted: tuple[SpectrumCandidate, ...]
+    likeliest: tuple[SpectrumCandidate, ...]
     """Those of the accepted ones that may be the plant in the middle."""
-    drawn: tuple[Candidate, ...]
+    drawn: tuple[SpectrumCandidate, ...]
     frame_hz: float | None
 
     def explained(self, frame_likely: float = LIKELY) -> Explained:
@@ -212,11 +212,11 @@ def same_test(spectra: Sequence[Spectrum], tests: Sequence[Excitation]) -> Excit
 
 
 def _accepted_and_drawn(
-    search: Search, found: Sequence[Candidate], progress: Callable[[float], None] | None
-) -> tuple[list[list[Candidate]], list[Candidate]]:
+    search: Search, found: Sequence[SpectrumCandidate], progress: Callable[[float], None] | None
+) -> tuple[list[list[SpectrumCandidate]], list[SpectrumCandidate]]:
     """Return what explains the spectra by kind of scatter, the best first, and draws around it."""
-    accepted: list[list[Candidate]] = []
-    drawn: list[Candidate] = []
+    accepted: list[list[SpectrumCandidate]] = []
+    drawn: list[SpectrumCandidate] = []
     for k, scatter in enumerate(SCATTERS):
         some = search.accepted(found, scatter)
         accepted.append(some)

@@ -22,7 +22,7 @@ from stillpath.models.identification.spectrum_model import spectrum_model
 from stillpath.models.identification.types import Excitation, ModeEstimate, Spectrum
 from stillpath.models.plants import PlantSpec, RelativeModesSpec, frequency_response
 
-__all__ = ["Candidate", "Search", "whitening_of"]
+__all__ = ["Search", "SpectrumCandidate", "whitening_of"]
 
 _DB = 10 / np.log(10)
 _SEED = 20
@@ -66,7 +66,7 @@ _SAME = 0.03
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Candidate:
+class SpectrumCandidate:
     """Parameters [log gain, log noise, modes ...] of a structure, and their residual.
 
     `cost` is twice the negative log of likelihood times prior, plus a penalty per parameter;
@@ -129,7 +129,7 @@ class Search:
         plateau = float(np.log(model.gain_of_plateau()))
         self._level = plateau if abs(plateau - _LEVEL) > _MISSTATED else float(_LEVEL)
 
-    def like(self, plant: PlantSpec) -> Candidate:
+    def like(self, plant: PlantSpec) -> SpectrumCandidate:
         """Return a start from a plant with modes.
 
         Raises
@@ -143,9 +143,9 @@ class Search:
         structure = ModalStructure(len(plant.modes), self._unit_hz)
         theta = structure.parameters(f_hz, zeta, share)
         quiet = float(self.model.log_psd.min())
-        return Candidate(structure, np.concatenate([[self._level, quiet - 3.0], theta]))
+        return SpectrumCandidate(structure, np.concatenate([[self._level, quiet - 3.0], theta]))
 
-    def candidates(self, progress: Callable[[float], None] | None) -> list[Candidate]:
+    def candidates(self, progress: Callable[[float], None] | None) -> list[SpectrumCandidate]:
         """Return fits from many starts, the best first."""
         whitening = whitening_of(SCATTERS[0].covariance(self.model))
         # More starts for larger orders, which have more ways to explain a spectrum.
@@ -166,7 +166,9 @@ class Search:
                 progress(0.2 + 0.3 * (k + 1) / _HOPS)
         return sorted(found, key=lambda c: c.cost)
 
-    def accepted(self, found: Sequence[Candidate], scatter: Scatter) -> list[Candidate]:
+    def accepted(
+        self, found: Sequence[SpectrumCandidate], scatter: Scatter
+    ) -> list[SpectrumCandidate]:
         """Return those of the fits, made anew with this scatter, that explain the spectrum."""
         whitening = self._whitening(found, scatter)
         log_psd = self.model.log_psd
@@ -174,7 +176,9 @@ class Search:
         again = self._distinct([self.polished(c, whitening, log_psd, 25) for c in starts])
         return [c for c in again if c.cost <= again[0].cost + _MUCH_WORSE]
 
-    def drawn(self, accepted: Sequence[Candidate], scatter: Scatter) -> list[Candidate]:
+    def drawn(
+        self, accepted: Sequence[SpectrumCandidate], scatter: Scatter
+    ) -> list[SpectrumCandidate]:
         """Return fits to resampled spectra."""
         whitening = self._whitening(accepted, scatter)
         enlarged = self._excess(accepted[0], scatter)
@@ -189,7 +193,7 @@ class Search:
             out.append(self._with_drawn_damping(self.polished(start, whitening, log_psd, 12)))
         return out
 
-    def _with_drawn_damping(self, fit: Candidate) -> Candidate:
+    def _with_drawn_damping(self, fit: SpectrumCandidate) -> SpectrumCandidate:
         """Draw the damping of modes beyond the band, of which only the flank was measured."""
         n, vector = fit.structure.modes, fit.vector.copy()
         beyond = np.exp(fit.theta[:n]) * self._unit_hz > _SEEN * self.model.f_hz[-1]
@@ -197,9 +201,9 @@ class Search:
         vector[2 + n : 2 + 2 * n][beyond] = self.rng.uniform(low, high, np.count_nonzero(beyond))
         return replace(fit, vector=vector)
 
-    def _distinct(self, fits: Sequence[Candidate]) -> list[Candidate]:
+    def _distinct(self, fits: Sequence[SpectrumCandidate]) -> list[SpectrumCandidate]:
         """Return the fits that respond differently from all better ones, the best first."""
-        distinct: list[Candidate] = []
+        distinct: list[SpectrumCandidate] = []
         answers: list[NDArray[np.complex128]] = []
         for one in sorted(fits, key=lambda c: c.cost):
             answer = one.structure.response(one.theta, self.model.f_hz)
@@ -208,19 +212,19 @@ class Search:
                 answers.append(answer)
         return distinct
 
-    def _whitening(self, fits: Sequence[Candidate], scatter: Scatter) -> Array:
+    def _whitening(self, fits: Sequence[SpectrumCandidate], scatter: Scatter) -> Array:
         """Return the whitening of errors, enlarged if even the best fit leaves more."""
         whitening = whitening_of(scatter.covariance(self.model))
         return np.asarray(whitening / self._excess(fits[0], scatter))
 
-    def _excess(self, best: Candidate, scatter: Scatter) -> float:
+    def _excess(self, best: SpectrumCandidate, scatter: Scatter) -> float:
         """Return how many times as large as the scatter the errors of the best fit are, from 1."""
         error = self.model.log_spectrum(best.structure, best.vector) - self.model.log_psd
         freedom = len(error) - best.structure.size - 2
         whitening = whitening_of(scatter.covariance(self.model))
         return max(1.0, float(np.sqrt(np.sum((whitening @ error) ** 2) / freedom)))
 
-    def _start(self, modes: int) -> Candidate:
+    def _start(self, modes: int) -> SpectrumCandidate:
         """Return a random start: modes at peaks, elsewhere in the band, perhaps one beyond it."""
         rng, model = self.rng, self.model
         structure = ModalStructure(modes, self._unit_hz)
@@ -242,9 +246,9 @@ class Search:
         share[0] = abs(share[0])
         theta = structure.parameters(np.concatenate([at_peaks, within, above]), zeta, share)
         quiet = float(model.log_psd.min())
-        return Candidate(structure, np.concatenate([[self._level, quiet - 3.0], theta]))
+        return SpectrumCandidate(structure, np.concatenate([[self._level, quiet - 3.0], theta]))
 
-    def _hop(self, base: Candidate) -> Candidate:
+    def _hop(self, base: SpectrumCandidate) -> SpectrumCandidate:
         """Return a start near a fit: a mode more, a mode elsewhere, or all of them moved a bit."""
         rng, n = self.rng, base.structure.modes
         f, zeta, share = base.structure.split(base.theta)
@@ -263,11 +267,11 @@ class Search:
             f, zeta, share = f * np.exp(jumps[0]), zeta * np.exp(jumps[1]), share + jumps[2]
         structure = ModalStructure(len(f), self._unit_hz)
         theta = structure.parameters(f * self._unit_hz, zeta, share)
-        return Candidate(structure, np.concatenate([base.vector[:2], theta]))
+        return SpectrumCandidate(structure, np.concatenate([base.vector[:2], theta]))
 
     def polished(
-        self, start: Candidate, whitening: Array, log_psd: Array, rounds: int
-    ) -> Candidate:
+        self, start: SpectrumCandidate, whitening: Array, log_psd: Array, rounds: int
+    ) -> SpectrumCandidate:
         """Minimise whitened errors plus the prior's penalty."""
         model, structure, n = self.model, start.structure, start.structure.modes
         band_hz = (_MODES_BAND[0] * model.f_hz[0], _MODES_BAND[1] * model.f_hz[-1])

@@ -79,6 +79,8 @@ class AccelerationLog:
         Tested axis as the file says: "x", "y", or a direction like "1.000,1.000".
     source : str
         The file's name, for messages.
+    may_hold_test : bool
+        Whether a resonance test may have made it: RepRapFirmware has none, and logs other motion.
     """
 
     time_s: Array
@@ -86,6 +88,7 @@ class AccelerationLog:
     axis: str | None = None
     source: str = ""
     notes: tuple[str, ...] = ()
+    may_hold_test: bool = True
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,7 +126,7 @@ class Spectrum:
     axis: str | None = None
     source: str = ""
     accel_per_hz_mm_s: float | None = None
-    """If the file says (Kalico)."""
+    """If the file says (Kalico), or the log that it was made of."""
     notes: tuple[str, ...] = ()
 
 

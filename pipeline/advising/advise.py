@@ -36,6 +36,7 @@ from stillpath.pipeline.advising.messages import (
 )
 from stillpath.pipeline.advising.reading import FirstReading
 from stillpath.pipeline.clock import StageClock
+from stillpath.pipeline.file_dialect import dialect_for, dialect_warnings
 from stillpath.pipeline.file_motion import STANDING_S, TextMotion
 from stillpath.pipeline.file_rewriting import file_rewriting
 from stillpath.pipeline.files import default_cache_dir
@@ -50,7 +51,6 @@ from stillpath.pipeline.options import Options, stamp
 from stillpath.pipeline.pacing.samples import take_samples
 from stillpath.pipeline.piece_compensator import DT_S
 from stillpath.pipeline.progress import ProgressCallback, ProgressReports
-from stillpath.pipeline.reading import dialect_for, doubts
 from stillpath.pipeline.result import (
     NOTHING_COMPENSATED,
     AdviceFigures,
@@ -100,7 +100,7 @@ def advise_file(
         container = file.container
         # Check before the work starts, too: advice only makes the file larger.
         _check_size(source.name, container.text, options.max_mb)
-        job = _Job(container.text, file.spool, machine, options, cache_dir, progress)
+        job = _AdvisedFile(container.text, file.spool, machine, options, cache_dir, progress)
         result = job.run(source.name, container.facts(), earlier, file.layers)
         _check_size(source.name, file.spool, options.max_mb)
         shutil.copyfileobj(file.spool, file.text, _BLOCK_BYTES)
@@ -118,7 +118,7 @@ def _check_size(name: str, text: BinaryIO, max_mb: float | None) -> None:
         )
 
 
-class _Job:
+class _AdvisedFile:
     """One file being advised."""
 
     def __init__(
@@ -140,7 +140,7 @@ class _Job:
         self._adviser = self._adapter.adviser(self._dialect)
         stated = self._adviser.stated or OFF
         self._before, self._unmodelled = stated.modelled, stated.unknown_types
-        self._doubts = doubts(source, machine, options.dialect)
+        self._dialect_warnings = dialect_warnings(source, machine, options.dialect)
         self._say("tuning the shaper to compare with", 0.0)
         with self._clock.stage("reference shaper"):
             self._shaper = cached_shaper(machine, cache_dir or default_cache_dir(), DT_S)
@@ -382,7 +382,7 @@ class _Job:
             peak_velocity_mm_s=0.0,
             peak_accel_mm_s2=max((f.accel_mm_s2 or 0.0 for f in figures.features), default=0.0),
             extruding_s=sum(group.seconds for group in features),
-            warnings=[*self._doubts, *asked.warnings, *warnings, *advised.warnings()],
+            warnings=[*self._dialect_warnings, *asked.warnings, *warnings, *advised.warnings()],
             notes=[*self._withdrawn, *noted, *kept_beyond(figures.features), _UNDO],
             layers=_merged(original.layers(), advised.layers()),
             features=features,

@@ -120,7 +120,7 @@ def create_app(
     app.add_middleware(
         Guard, allowed_hosts=hosts_of(settings, keys_required), trusts_all=not keys_required
     )
-    app.add_middleware(metrics.Measured, metrics=app.state.metrics)
+    app.add_middleware(metrics.RequestMetrics, metrics=app.state.metrics)
     app.add_middleware(Proxies, trusted=settings.trusted_proxies)
     problems.install(app)
     app.add_exception_handler(StillRunning, still_running)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from stillpath.service.jobs.store import JobStore
 
-__all__ = ["Measured", "Metrics", "router"]
+__all__ = ["Metrics", "RequestMetrics", "router"]
 
 _SETTLED_S = 5.0
 """Jobs that ended longer ago have been written down by every worker."""
@@ -156,7 +156,7 @@ class Metrics(Collector):
         )
 
 
-class Measured:
+class RequestMetrics:
     """ASGI middleware that counts requests by the route's template, never by what a caller wrote.
 
     Parameters

@@ -20,7 +20,7 @@ from starlette.responses import Response
 from stillpath.service.api.file_responses import matches
 from stillpath.service.api.problems import Problem
 
-__all__ = ["Page", "PageFile", "page_files", "router"]
+__all__ = ["PageFile", "WebPage", "page_files", "router"]
 
 _PACKAGE = "stillpath.service.web"
 _INDEX = "index.html"
@@ -68,7 +68,7 @@ class PageFile:
 
 
 @dataclass(frozen=True)
-class Page:
+class WebPage:
     """The page and the files it needs, by their paths."""
 
     version: str
@@ -77,7 +77,7 @@ class Page:
 
 
 @lru_cache(maxsize=1)
-def page_files() -> Page:
+def page_files() -> WebPage:
     """Return the files of the page, read once by each process."""
     contents = dict(sorted(_walk(resources.files(_PACKAGE), "")))
     index = contents.pop(_INDEX)
@@ -85,7 +85,7 @@ def page_files() -> Page:
     for path, content in contents.items():
         digest.update(f"{path}\0{len(content)}\0".encode() + content)
     version = digest.hexdigest()[:12]
-    return Page(
+    return WebPage(
         version=version,
         index=PageFile(index.replace(_PLACEHOLDER, version.encode()), _TYPES["html"]),
         files={

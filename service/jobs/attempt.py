@@ -36,14 +36,14 @@ from stillpath.service.jobs.task import Runner, Task
 from stillpath.service.jobs.watch import AttemptLimits, Watch
 from stillpath.service.settings import Settings
 from stillpath.service.storage import Storage, StorageError, sha256_of
-from stillpath.service.storage.disk import DISK_FULL, Disk, Written, written_bytes
+from stillpath.service.storage.disk import DISK_FULL, Disk, PeakDiskUse, written_bytes
 
-__all__ = ["Attempt", "Workplace"]
+__all__ = ["Attempt", "WorkerContext"]
 
 
 @dataclass(frozen=True, slots=True)
-class Workplace:
-    """The environment of a worker.
+class WorkerContext:
+    """What the attempts of a worker process share.
 
     Attributes
     ----------
@@ -73,13 +73,13 @@ class Attempt:
         As it was claimed.
     """
 
-    def __init__(self, job: Job, workplace: Workplace, limits: AttemptLimits) -> None:
-        settings = workplace.settings
+    def __init__(self, job: Job, context: WorkerContext, limits: AttemptLimits) -> None:
+        settings = context.settings
         self._job, self._limits = job, limits
-        self._settings, self._store, self._storage = settings, workplace.store, workplace.storage
-        self._folder = workplace.scratch / f"{job.id}-{job.attempt}"
+        self._settings, self._store, self._storage = settings, context.store, context.storage
+        self._folder = context.scratch / f"{job.id}-{job.attempt}"
         self._disk = Disk(settings.data_dir, settings.disk_reserve_bytes)
-        self._written = Written(self._folder)
+        self._written = PeakDiskUse(self._folder)
         self._log = structlog.get_logger("worker")
 
     def has_room(self) -> bool:

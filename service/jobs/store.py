@@ -45,7 +45,7 @@ from stillpath.service.jobs.state import (
 from stillpath.service.jobs.stored_rows import OVER, from_row, stored_job, to_row
 from stillpath.service.jobs.submissions import Quota, same_job, submission, submit, usage
 
-__all__ = ["BadCursor", "JobStore", "Page"]
+__all__ = ["BadCursor", "JobListing", "JobStore"]
 
 _JOBS = tables.jobs.c
 _CLOCKS_APART = 12
@@ -67,7 +67,7 @@ class BadCursor(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Page:
+class JobListing:
     """A page of jobs, newest first, and the cursor of the next page (None: there is none)."""
 
     jobs: list[Job]
@@ -161,7 +161,7 @@ class JobStore:
         batch: str | None = None,
         limit: int,
         cursor: str | None = None,
-    ) -> Page:
+    ) -> JobListing:
         """Return jobs, newest first.
 
         Parameters
@@ -192,7 +192,7 @@ class JobStore:
             query = query.where(tuple_(_JOBS.created_at, _JOBS.id) < tuple_(*_from_cursor(cursor)))
         found = self._jobs(query.limit(limit + 1))
         more = len(found) > limit
-        return Page(found[:limit], _to_cursor(found[limit - 1]) if more else None)
+        return JobListing(found[:limit], _to_cursor(found[limit - 1]) if more else None)
 
     def in_state(self, state: JobState) -> list[Job]:
         """Return all jobs in a state, oldest first."""

@@ -18,7 +18,7 @@ import structlog
 from stillpath.pipeline.progress import Progress
 from stillpath.service.database.engine import DatabaseAway, StoreError, open_database
 from stillpath.service.environment import prepare_environment
-from stillpath.service.jobs.attempt import Attempt, Workplace
+from stillpath.service.jobs.attempt import Attempt, WorkerContext
 from stillpath.service.jobs.computations import run_computation
 from stillpath.service.jobs.patience import patiently
 from stillpath.service.jobs.state import JobKind
@@ -59,36 +59,36 @@ def run_job(job_id: str, settings: dict[str, Any] | None, runner: str) -> None:
 
     given = None if settings is None else json.dumps(settings, sort_keys=True)
     own, store, storage = _opened(given)
-    workplace = Workplace(
+    context = WorkerContext(
         own, store, storage, Path(worker.local_directory), interrupted=interrupted
     )
-    execute(job_id, workplace, pkgutil.resolve_name(runner))
+    execute(job_id, context, pkgutil.resolve_name(runner))
 
 
-def execute(job_id: str, workplace: Workplace, runner: Runner) -> None:
+def execute(job_id: str, context: WorkerContext, runner: Runner) -> None:
     """Claim a job, do it, and record its outcome; do nothing if it cannot be claimed."""
-    store = workplace.store
-    job = patiently(lambda: store.claim(job_id, time.time(), workplace.name), DatabaseAway)
+    store = context.store
+    job = patiently(lambda: store.claim(job_id, time.time(), context.name), DatabaseAway)
     if job is None:
         return
     log = structlog.get_logger("worker")
-    limits = AttemptLimits.of(job.kind, workplace.settings)
+    limits = AttemptLimits.of(job.kind, context.settings)
     # The watch checks periodically; this limit acts in between, and includes freed memory.
     limit_memory(limits.max_bytes + max(limits.max_bytes // 4, _KEPT_BYTES))
     if job.kind is not JobKind.COMPENSATION:
         runner = run_computation
-    attempt = Attempt(job, workplace, limits)
+    attempt = Attempt(job, context, limits)
     watch = Watch(
         store,
         job,
         limits,
-        interrupted=workplace.interrupted,
+        interrupted=context.interrupted,
         has_room=attempt.has_room,
         no_room=attempt.no_room,
-        end=workplace.end,
+        end=context.end,
     )
     with structlog.contextvars.bound_contextvars(job=job.id, attempt=job.attempt):
-        log.info("job started", worker=workplace.name)
+        log.info("job started", worker=context.name)
         with watch:
             event = attempt.run(runner, watch)
         # A decision of the watch that was not stored yet comes first.
@@ -99,7 +99,7 @@ def execute(job_id: str, workplace: Workplace, runner: Runner) -> None:
         attempt.tidy()
         log.info("job over", outcome="dropped" if event is None else type(event).__name__)
     if watch.outgrown or (job.kind.is_short and held_bytes() > _MOST_KEPT_BYTES):
-        workplace.end(0)
+        context.end(0)
 
 
 def run_compensation(task: Task, progress: Callable[[Progress], None]) -> dict[str, Any]:

@@ -14,7 +14,7 @@ import structlog
 
 from stillpath.service.permissions import private_folder
 
-__all__ = ["DISK_FULL", "Disk", "NoRoom", "Written", "refuses_more", "written_bytes"]
+__all__ = ["DISK_FULL", "Disk", "NoRoom", "PeakDiskUse", "refuses_more", "written_bytes"]
 
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 """Error numbers of a full disk."""
@@ -148,7 +148,7 @@ class Disk:
             structlog.get_logger("disk").warning("the disk is full; the reserve was given up")
 
 
-class Written:
+class PeakDiskUse:
     """The most that the work in a folder has taken on the disk.
 
     A file that is not complete has no name on Linux (`pipeline.files.replacing`), and is gone once

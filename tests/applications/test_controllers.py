@@ -299,7 +299,9 @@ def test_damaged_controllers_are_not_loaded(edit: Callable[[Any], Any], words: s
         read_controller(json.dumps(document))
 
 
-def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_writes_json_header_and_pages(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     targets = {name: tmp_path / name for name in ("c.json", "c.h", "pages")}
     files = ["--json", str(targets["c.json"]), "--c-header", str(targets["c.h"])]
     asked = ["controller", "--machine", "galvo-40khz", "--method", "fmsdob"]

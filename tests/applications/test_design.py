@@ -388,7 +388,7 @@ def test_charts_stay_within_their_frame() -> None:
     assert min(np.abs(np.diff(sorted(ends)))) >= 12
 
 
-def test_command(
+def test_the_command_passes_its_options_on_and_writes_the_page(
     tmp_path: Path, off: DesignReport, monkeypatch: pytest.MonkeyPatch, capsys: Any
 ) -> None:
     asked = []

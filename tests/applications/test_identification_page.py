@@ -7,6 +7,7 @@ import hashlib
 import json
 import math
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -28,10 +29,14 @@ from stillpath.models.plants import frequency_response
 from stillpath.models.provenance import MeasuredMode
 from stillpath.models.store import load_machine
 from tests.models.identification.recordings import (
+    QUICK,
     QUICK_SETTINGS,
     TAZ,
+    late_by_less,
     one_mode,
+    quick_log,
     quick_raw,
+    raw_file,
     spectrum_file,
 )
 
@@ -216,3 +221,19 @@ def test_what_a_mode_was_before() -> None:
     before = [MeasuredMode(f_hz=50.0, zeta=0.05), MeasuredMode(f_hz=100.0, zeta=0.05)]
     assert change_text(MeasuredMode(f_hz=51.0, zeta=0.05), before) == "50.0 Hz (+2.0 %)"
     assert change_text(MeasuredMode(f_hz=70.0, zeta=0.05), before) == "new"
+
+
+@pytest.mark.slow
+def test_a_spectrum_of_a_log_is_predicted_for_the_strength_that_the_log_shows() -> None:
+    """Where the phase of a log is not used; as for 60, the curve lay 3.4 dB too low."""
+    plant = one_mode(42.0, 0.06)
+    test = replace(QUICK, f_end_hz=90.0, sweeping_accel_mm_s2=400.0, accel_per_hz_mm_s=90.0)
+    log = late_by_less(quick_log(plant=plant, test=test), plant, 0.6)
+    settings = ReadSettings(f_end_hz=90.0, hz_per_s=2.0)
+    found = identify_files([raw_file(log)], load_machine("ender3"), settings, name="m")
+    (axis,) = found.report.axes
+    assert any("accel_per_hz 90 instead" in note for note in axis.notes)
+    (drawn,) = axis.spectra
+    measured, predicted = np.array(drawn.measured), np.array(drawn.predicted)
+    inside = (np.array(drawn.f_hz) > 10.0) & (np.array(drawn.f_hz) < 80.0)
+    assert 10 * np.log10(measured / predicted)[inside].mean() == pytest.approx(0.0, abs=0.5)

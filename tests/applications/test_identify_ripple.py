@@ -108,7 +108,7 @@ def test_a_title_that_no_machine_has(folder: Path, capsys: pytest.CaptureFixture
     assert said.count("\n") == 1
 
 
-def test_parts() -> None:
+def test_a_basis_is_read_from_its_parts() -> None:
     basis = parse_basis("motor pole:0.8:1,4@output")
     assert (basis.name, basis.pitch_mm, basis.numbers) == ("motor pole", 0.8, (1, 4))
     assert basis.enters == "output"

@@ -176,11 +176,12 @@ def test_damping_that_changed(machine, printed, tmp_path):
     assert "the damping does not" in report.verdicts[0]
 
 
-def test_a_log_of_reprapfirmware(machine, printed, tmp_path):
+def test_a_log_of_reprapfirmware_needs_no_resonance_test(machine, printed, tmp_path):
     log = tmp_path / "0_2026-11-21.csv"
     record(printed, machine, log, start_s=300, seconds=20, rate_hz=1344, clock=1.0, rrf=True)
     report = verify_log(printed, log, machine)
     assert report.outcome == "the model holds"
+    assert not any("resonance test" in note for note in report.notes)
 
 
 def test_files_that_are_no_log(machine, printed, tmp_path):

@@ -181,7 +181,7 @@ def test_preview_command_on_every_loop(name: str) -> None:
         assert len(preview_command(loop, y_d[:length])) == length
 
 
-def test_files(tmp_path: Path) -> None:
+def test_csv_npz_and_page_hold_the_same_command(tmp_path: Path) -> None:
     scan = scan_file(EXAMPLE, load_loop("galvo-10khz"), SCALED)
     write_command(scan, tmp_path / "c.csv")
     write_command(scan, tmp_path / "c.npz")
@@ -195,7 +195,7 @@ def test_files(tmp_path: Path) -> None:
     assert "<script" not in page
 
 
-def test_refusals() -> None:
+def test_a_scan_that_cannot_be_says_why() -> None:
     spec = load_loop("galvo-10khz")
     with pytest.raises(DesignError, match="--um-per-unit"):
         scan_file(EXAMPLE, spec, ScanSettings())
@@ -230,7 +230,9 @@ def test_the_prefilter_can_be_loaded(cutoff_hz: float | None, tmp_path: Path) ->
     np.testing.assert_allclose(r[ahead:], made.command[0], atol=1e-9 * np.abs(r).max())
 
 
-def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_scans_with_a_controller_from_a_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     machine = ["-m", "galvo-40khz"]
     file, out = tmp_path / "c.json", tmp_path / "out.csv"
     design = ["controller", *machine, "--method", "fmsdob", "--targets-hz", "800"]

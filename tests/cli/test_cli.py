@@ -259,7 +259,7 @@ def test_plan_and_simulate(pipeline, source, tmp_path, capsys):
 @pytest.mark.parametrize(
     "arguments", ["serve --host 0.0.0.0", "serve --host printer.lan", "serve --workers 0", "fly"]
 )
-def test_refusals(arguments, capsys, monkeypatch, tmp_path):
+def test_what_cannot_be_done_is_said_in_one_line(arguments, capsys, monkeypatch, tmp_path):
     monkeypatch.setenv("STILLPATH_DATA_DIR", str(tmp_path))
     monkeypatch.setenv("STILLPATH_KEYS", "false")
     assert run(arguments.split()) == 2

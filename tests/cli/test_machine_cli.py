@@ -230,7 +230,9 @@ def test_what_the_shell_of_windows_writes(store: MachineStore, tmp_path: Path, c
         ("from-config {folder}/none.cfg --name mine", "none.cfg"),
     ],
 )
-def test_refusals(store: MachineStore, tmp_path: Path, capsys, arguments: str, words: str):
+def test_what_is_refused_stores_nothing(
+    store: MachineStore, tmp_path: Path, capsys, arguments: str, words: str
+):
     assert machines(*arguments.format(folder=tmp_path).split()) == 2
     assert words in one_line(capsys)
     assert list(tmp_path.iterdir()) == []

@@ -54,7 +54,7 @@ def test_orthonormal(name: str, n: int, in_preview: bool) -> None:
 
 
 @pytest.mark.parametrize("name", ["dct", "ce-opt", "robust"])
-def test_nested(name: str) -> None:
+def test_fewer_functions_are_the_first_of_more(name: str) -> None:
     lifted = plant_set()
     np.testing.assert_allclose(BASES[name](lifted, 30)[:, :12], BASES[name](lifted, 12), atol=1e-9)
 
@@ -189,6 +189,6 @@ def test_every_input_gets_the_functions() -> None:
         (lambda s: spread_functions(np.diag(np.arange(80.0)), s.gram), "zero: take r = 1"),
     ],
 )
-def test_messages(make, message: str) -> None:
+def test_a_basis_that_cannot_be_says_why(make, message: str) -> None:
     with pytest.raises(DesignError, match=message):
         make(plant_set())

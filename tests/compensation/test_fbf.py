@@ -90,7 +90,7 @@ def test_short_pieces(machine: Machine, samples: int) -> None:
     np.testing.assert_allclose(u[:, [0, -1]], path[:, [0, -1]], atol=1e-9)
 
 
-def test_improves(machine: Machine) -> None:
+def test_the_contour_error_falls_to_a_tenth(machine: Machine) -> None:
     path, extruding, rests = strokes()
     plants = [plant_set(machine.axes[a], DT_S).nominal for a in ("x", "y")]
     u = made(machine, path[:, 0]).compensate(path, extruding, rests)

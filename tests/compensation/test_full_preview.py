@@ -267,6 +267,6 @@ G = lift(one_mode(), M)
         (lambda: independence(one_mode(), np.eye(M), np.ones((1, M))), r"\(2, 90\) needed"),
     ],
 )  # fmt: skip
-def test_messages(make, message: str) -> None:
+def test_a_design_that_cannot_be_says_why(make, message: str) -> None:
     with pytest.raises(DesignError, match=message):
         make()

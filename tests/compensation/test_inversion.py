@@ -145,7 +145,7 @@ def test_ts_reaches_constant_positions_only_when_told_to() -> None:
     np.testing.assert_allclose(scaled.apply(y_d), 7.0)
 
 
-def test_refusals() -> None:
+def test_zeros_that_cannot_be_inverted_are_refused() -> None:
     on_circle = np.exp(0.2j * np.pi)
     circle = third_order(on_circle, on_circle.conjugate())
     for kind in ("ts", "zmetc"):

@@ -100,7 +100,7 @@ def test_rests_are_kept() -> None:
     assert np.all(np.diff(u[:, 479:540]) == 0)
 
 
-def test_refusals() -> None:
+def test_a_machine_too_slow_for_the_inverse_is_refused() -> None:
     machine = load_machine("ender3")
     slow = machine.model_copy(
         update={"command": machine.command.model_copy(update={"accel_mm_s2": 100.0})}

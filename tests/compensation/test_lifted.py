@@ -165,6 +165,6 @@ UNSTABLE = DiscretePlant(np.array([[1.02]]), np.ones(1), np.ones(1), 0.0)
         (lambda: lifted_set_of([lift([1.0], 4), lift([1.0], 3)], [0.5, 0.5]), "one shape"),
     ],
 )
-def test_messages(make, message: str) -> None:
+def test_a_system_that_cannot_be_lifted_says_why(make, message: str) -> None:
     with pytest.raises(DesignError, match=message):
         make()

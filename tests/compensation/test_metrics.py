@@ -126,6 +126,6 @@ def test_metric_tends_to_the_two_norm() -> None:
         (lambda: toeplitz_metric(np.ones(5), 2), "5 coefficients over 2 samples"),
     ],
 )
-def test_messages(make, message: str) -> None:
+def test_figures_that_cannot_be_say_why(make, message: str) -> None:
     with pytest.raises(DesignError, match=message):
         make()

@@ -122,6 +122,6 @@ def test_two_steps_with_a_given_model() -> None:
         (lambda: two_step(equal(lags()), 0), "n = 0 robust functions"),
     ],
 )
-def test_messages(make, message: str) -> None:
+def test_a_nominal_model_that_cannot_be_says_why(make, message: str) -> None:
     with pytest.raises(DesignError, match=message):
         make()

@@ -103,7 +103,9 @@ def test_default_bandwidth() -> None:
     st.floats(0.1, 10.0),
     st.floats(-3.2, 3.2),
 )
-def test_invariants(seed: int, kind: Distribution, size: float, angle: float) -> None:
+def test_the_robust_response_scales_and_turns_with_the_set(
+    seed: int, kind: Distribution, size: float, angle: float
+) -> None:
     """Scales and turns with the set, does not care for its order, never tracks more than all."""
     g = spread(np.random.default_rng(seed), 4, 6)
     response, tracked = robust_response(g, distribution=kind)
@@ -223,7 +225,7 @@ def test_measured_responses_are_joined_to_a_model() -> None:
     assert made.response[0] == pytest.approx(1.0)
 
 
-def test_refusals() -> None:
+def test_responses_that_allow_no_model_are_refused() -> None:
     with pytest.raises(DesignError, match="no distribution is called 'normal'"):
         robust_response(np.ones((2, 3)), distribution="normal")  # type: ignore[arg-type]
     with pytest.raises(DesignError, match="all directions at frequency 1"):

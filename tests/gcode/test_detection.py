@@ -48,7 +48,7 @@ EXPECTED = {
 
 
 @pytest.mark.shared
-def test_corpus(shared_dir: Path) -> None:
+def test_the_firmware_of_every_file_of_the_corpus(shared_dir: Path) -> None:
     found = {}
     for path in sorted((shared_dir / "corpus").glob("*/*.gz")):
         data = gzip.decompress(path.read_bytes())
@@ -76,7 +76,7 @@ def test_corpus(shared_dir: Path) -> None:
         ("G1 X1\n; SET_VELOCITY_LIMIT in a comment is no command\nM205 X8 Y8\n", "marlin"),
     ],
 )
-def test_signs(text: str, dialect: str) -> None:
+def test_single_commands_tell_the_firmware(text: str, dialect: str) -> None:
     assert detect(text.encode()).dialect == dialect
 
 

@@ -253,7 +253,9 @@ def test_where_it_ends(case: str, name: str, read) -> None:
         ("; fan\rM106 S9", "reprapfirmware", "carriage return"),
     ],
 )
-def test_refused(line: str, name: str, words: str, read) -> None:
+def test_lines_that_a_firmware_would_not_execute_are_refused(
+    line: str, name: str, words: str, read
+) -> None:
     with pytest.raises(GcodeError, match=words):
         read(line + "\n", name)
 
@@ -311,7 +313,7 @@ def test_pieces_of_arcs_of_a_buddy(read, feed: int, pieces: int) -> None:
     assert len(block.moves) - 1 == pieces
 
 
-def test_limits(read) -> None:
+def test_marlin_limits_follow_the_file(read) -> None:
     text = "M201 X1000 E5000\nM203 X300\nM204 P1500 T2500\nM205 X8 B0 J0.02\nM204 S700\n"
     block, _ = read(text, "marlin")
     after = block.limits[block.events.limits_id[-1]]
@@ -385,7 +387,7 @@ def test_repeated_lines_do_the_same_again(name: str, read) -> None:
     assert interpreter.feature_names == ["a", "b"]
 
 
-def test_dwells(read) -> None:
+def test_g4_lasts_as_each_firmware_reads_it(read) -> None:
     def dwell(text: str, name: str) -> list[float]:
         return read(text, name)[0].events.dwell_s.tolist()
 
@@ -396,7 +398,7 @@ def test_dwells(read) -> None:
     assert block.events.kind[0] == EventKind.HARMLESS
 
 
-def test_tools(read) -> None:
+def test_a_change_of_tools_makes_the_position_unknown(read) -> None:
     block, _ = read("G1 X1 F600\nT1\nG1 X2\nT0\nG1 X3\n", "marlin")
     assert block.moves.tool.tolist() == [0, 1, 0]
     assert block.events.kind.tolist() == [EventKind.UNKNOWN] * 2
@@ -538,7 +540,7 @@ def test_limits_of_kalico_are_reset(read) -> None:
 
 
 @pytest.mark.parametrize("line", CLASSES)
-def test_classes(line: str, read) -> None:
+def test_each_firmware_takes_a_line_for_its_own_kind_of_event(line: str, read) -> None:
     for name, kind in CLASSES[line].items():
         assert read(f"{line}\n", name)[0].events.kind.tolist() == [kind], name
 
@@ -645,7 +647,7 @@ def test_saved_places_are_as_many_as_the_firmware_has(read) -> None:
     assert len(read(text, "marlin")[1].state.saved) == 256
 
 
-def test_hop(read) -> None:
+def test_marlin_hops_with_its_firmware_retraction(read) -> None:
     block, _ = read("M83\nM207 S1 F1800 Z0.4\nG1 X1 Z1 F600\nG10\nG1 X2\nG11\nG1 X3 Z1\n", "marlin")
     assert block.moves.end_mm[:, 2].tolist() == pytest.approx([1, 1, 1.4, 1.4, 1, 1, 1])
     assert block.moves.end_mm[:, 3].tolist() == pytest.approx([0, -1, -1, -1, -1, 0, 0])

@@ -79,7 +79,7 @@ REFUSED = {(kind, NO_NUMBER) for kind in KINDS if kind != "marlin"} | {("klipper
 @pytest.mark.parametrize(
     ("kind", "name"), [case for case in product(KINDS, CASES) if case not in REFUSED]
 )
-def test_filament(kind: str, name: str, cache: Path) -> None:
+def test_the_printer_feeds_what_the_file_feeds(kind: str, name: str, cache: Path) -> None:
     check(START + CASES[name] + "\n", kind, cache, reverts=False)
 
 

@@ -28,7 +28,7 @@ def kinds(block: ProgramBlock) -> list[EventKind]:
     return [EventKind(kind) for kind in block.events.kind]
 
 
-def test_words(golden_machine: Machine) -> None:
+def test_words_in_every_spelling(golden_machine: Machine) -> None:
     block = run(
         "G28\nM83\ng1x10y5f3000\nG1X20.Y.5E.02\nG1 X+21 Y-0.0\n  \tG1\tX27\tY8\tE.1   \r\n"
         "G1 X92 X93 ; X5\nN4G1X83Y80\nN1 G1 X81 Y80 E.1*83\nG1 X1.5E1\n"
@@ -64,7 +64,7 @@ def test_modes_and_origins(golden_machine: Machine) -> None:
     assert [m.absolute_e for m in modal] == [True, True, True, True, False, True]
 
 
-def test_factors(golden_machine: Machine) -> None:
+def test_m220_and_m221_scale_speed_and_filament(golden_machine: Machine) -> None:
     block = run(
         "G28\nG1 X10 E10 F6000\nM221 S50\nG1 X20 E12\nM220 S50\nG1 X30\nG1 X40 F3000\nM220\n"
         "G1 X50\nM221\nG1 X60 E13\n",
@@ -75,7 +75,7 @@ def test_factors(golden_machine: Machine) -> None:
     assert block.modal[block.moves.modal_id[3]].speed_factor == pytest.approx(0.5)
 
 
-def test_limits(golden_machine: Machine) -> None:
+def test_klipper_limits_follow_the_file(golden_machine: Machine) -> None:
     block = run(
         "M204 S1000\nM204 P800 T1500 R9\nM204 P700\n"
         "set_velocity_limit velocity=250 ACCEL=4000 ACCEL_TO_DECEL=2000 ; x\n"
@@ -193,7 +193,9 @@ def test_quarter_arc_and_circle(golden_machine: Machine) -> None:
         ("SET_VELOCITY_LIMIT ACCEL", "KEY=VALUE"),
     ],
 )
-def test_refused(line: str, words: str, golden_machine: Machine) -> None:
+def test_lines_that_klipper_would_not_execute_are_refused(
+    line: str, words: str, golden_machine: Machine
+) -> None:
     with pytest.raises(GcodeError, match=words) as caught:
         run(f"G28\n{line}\n", golden_machine)
     assert caught.value.line == 2 + line.count("\n")
@@ -221,7 +223,7 @@ def test_bounds_only_where_known(wary_machine: Machine) -> None:
     assert len(block.moves) == 1
 
 
-def test_known_axes(wary_machine: Machine) -> None:
+def test_axes_are_known_until_a_macro_may_have_moved_them(wary_machine: Machine) -> None:
     block = run(
         "G28\nG1 X5\nG1 X6 Y5\nG1 X7 Y6\nSTART_PRINT A=1\nG91\nG1 X1\nG90\nG1 X1\nG1 X2\n"
         "G28 X\nG1 X0 Y0\n",
@@ -241,7 +243,7 @@ def test_known_axes(wary_machine: Machine) -> None:
     ]
 
 
-def test_classes(wary_machine: Machine) -> None:
+def test_lines_are_harmless_stops_or_unknown(wary_machine: Machine) -> None:
     expected = {
         "; comment": EventKind.HARMLESS,
         "": EventKind.HARMLESS,
@@ -458,7 +460,7 @@ def test_states_and_offsets(golden_machine: Machine) -> None:
     assert block.moves.speed_mm_s.tolist() == pytest.approx([100, 1, 7, 100, 100, 100])
 
 
-def test_marks(golden_machine: Machine) -> None:
+def test_moves_carry_layer_feature_and_object_of_the_marks(golden_machine: Machine) -> None:
     text = (
         "G28\n;LAYER_CHANGE\n;Z:.3\n;TYPE:Perimeter\n; printing object A id:0 copy 0\nG1 X1\n"
         "; stop printing object A id:0 copy 0\n;TYPE:Infill\nG1 X2\n;LAYER_CHANGE\n;Z:.5\n"
@@ -523,7 +525,7 @@ def test_origin_set_from_a_guess_stays_a_guess(wary_machine: Machine) -> None:
     assert block.moves.known.tolist() == [0, 0, 0, 1]
 
 
-def test_origin(golden_machine: Machine) -> None:
+def test_g92_and_offsets_move_the_origin(golden_machine: Machine) -> None:
     block = run(
         "G28\nG1 X10\nG92 X0\nG1 X1\nSET_GCODE_OFFSET Z=0.2\nG1 X2 Z1\nG28\nG1 X2\n",
         golden_machine,

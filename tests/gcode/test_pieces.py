@@ -77,7 +77,7 @@ def test_nothing_is_lost(machine: Machine, seed: int, wild: bool, chunk: int) ->
 
 
 @pytest.mark.parametrize("ending", [b"\n", b"\r\n", b""])
-def test_line_ends(machine: Machine, ending: bytes) -> None:
+def test_pieces_join_to_the_file_whatever_its_line_ends(machine: Machine, ending: bytes) -> None:
     text = (HEAD + "G1 X80 E1\nG1 X80 Y80 E1 ; last").encode().replace(b"\n", ending or b"\n")
     data = text + ending
     check(cut(data, machine), data)
@@ -185,7 +185,7 @@ def test_no_motor_steps_where_a_jump_is_caught(
 @pytest.mark.parametrize(
     "barrier", ["G28", "SOME_MACRO", "T1", "PAUSE", "BED_MESH_CALIBRATE", "G4 P5", "M400"]
 )
-def test_barriers(machine: Machine, barrier: str) -> None:
+def test_no_piece_reaches_across_a_barrier(machine: Machine, barrier: str) -> None:
     text = HEAD + f"G1 X80 E1\n{barrier}\nG1 X20\nG1 Y20\nG1 X30\nG1 Y30\n"
     items = cut(text.encode(), machine)
     check(items, text.encode())

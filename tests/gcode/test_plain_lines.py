@@ -78,7 +78,7 @@ def test_same_as_the_slow_kernel(golden_machine: Machine, firmware, lines: list[
 
 @relaxed
 @given(NUMBERS, st.sampled_from([" ", "\n", "E", ";", "/", ":", "\xff"]))
-def test_numbers(text: str, behind: str) -> None:
+def test_numbers_are_read_as_python_reads_them(text: str, behind: str) -> None:
     """A number that is read is the double that Python reads, and ends where it ends."""
     raw = np.frombuffer((text + behind + "\n" * 16).encode("latin-1"), np.uint8)
     value, end = decimal(raw, 0)

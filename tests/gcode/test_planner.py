@@ -53,7 +53,7 @@ def straight(*lengths: float, speed: float = 100.0) -> Moves:
 # By hand
 
 
-def test_trapezoid() -> None:
+def test_one_move_is_a_trapezoid() -> None:
     plan = plan_moves(straight(50.0), LIMITS, FIRMWARE)
     # 100 mm/s at 5000 mm/s2: 20 ms and 1 mm up, 48 mm level, the same down.
     assert [plan.accel_s[0], plan.cruise_s[0], plan.decel_s[0]] == pytest.approx([0.02, 0.48, 0.02])
@@ -82,7 +82,7 @@ def test_extruder_corner_and_only_moves() -> None:
     assert plan.accel_mm_s2[2] == 5000
 
 
-def test_z_limits() -> None:
+def test_z_limits_slow_down_what_climbs() -> None:
     steps = np.array([[0, 0, 10.0, 0], [30.0, 0, 10.0, 0]])
     plan = plan_moves(moves_of(steps, np.full(2, 100.0), np.zeros(2, np.int64)), LIMITS, FIRMWARE)
     assert plan.accel_mm_s2 == pytest.approx([200, 200 * math.sqrt(10)])
@@ -219,7 +219,7 @@ TOLERANT = FIRMWARE.model_copy(update={"extruder": thick})
 
 @settings(max_examples=60)
 @given(streams())
-def test_twin(moves: Moves) -> None:
+def test_the_planner_agrees_with_plain_python(moves: Moves) -> None:
     plan = plan_moves(moves, LIMITS, TOLERANT)
     expected = np.array(twin(moves, LIMITS, TOLERANT)).reshape(-1, 3)
     got = np.column_stack((plan.start_mm_s, plan.cruise_mm_s, plan.end_mm_s)) ** 2

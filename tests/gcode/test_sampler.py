@@ -43,7 +43,7 @@ def plan(golden_machine: Machine) -> Phases:
 
 @settings(max_examples=50)
 @given(st.lists(st.floats(-1, 6), max_size=40).map(sorted))
-def test_twin(plan: Phases, times: list[float]) -> None:
+def test_the_sampler_agrees_with_plain_python(plan: Phases, times: list[float]) -> None:
     position, row = sample_phases(plan, np.array(times))
     expected = np.array([position_at(plan, t) for t in times]).reshape(-1, 4).T
     np.testing.assert_allclose(position, expected, rtol=0, atol=1e-9)
@@ -69,7 +69,9 @@ def test_grid_as_times(plan: Phases, axes: int) -> None:
     st.lists(st.tuples(st.integers(0, 400), st.floats(-1, 6), st.floats(0, 6)), max_size=6),
     st.integers(0, 1000),
 )
-def test_distances(plan: Phases, stretches: list[tuple[int, float, float]], seed: int) -> None:
+def test_distances_agree_with_plain_numpy(
+    plan: Phases, stretches: list[tuple[int, float, float]], seed: int
+) -> None:
     count, dt_s = 400, 4e-3
     points = np.random.default_rng(seed).normal(scale=20.0, size=(2, count))
     first = np.array([0, *sorted(at for at, _, _ in stretches)])
@@ -105,7 +107,7 @@ def test_streaming_has_no_gap(plan: Phases, cuts: list[int], dt_s: float) -> Non
     np.testing.assert_array_equal(np.concatenate([p.moving for p in parts]), t_s <= end_s[row])
 
 
-def test_refused(plan: Phases) -> None:
+def test_grids_that_cannot_be_sampled_are_refused(plan: Phases) -> None:
     none = rows_of(plan, slice(0))
     with pytest.raises(ValueError, match="no phases"):
         sample_phases(none, (0.0, 1.0, 1))

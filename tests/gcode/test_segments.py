@@ -86,7 +86,9 @@ def fit(command: np.ndarray, tolerance_mm: float, plant: DiscretePlant = SILENT)
 )
 @example(seed=322, samples=319, tolerance_um=5.0, speed=5.0, shaped=False)
 @example(seed=218724, samples=211, tolerance_um=20.0, speed=5.0, shaped=False)
-def test_bounds(seed: int, samples: int, tolerance_um: float, speed: float, shaped: bool) -> None:
+def test_segments_stay_within_their_tolerance(
+    seed: int, samples: int, tolerance_um: float, speed: float, shaped: bool
+) -> None:
     command, tolerance = curvy(seed, samples, speed), 1e-3 * tolerance_um
     segments = fit(command, tolerance, one_mode(45.0, 0.03) if shaped else SILENT)
     error = executed(segments, command) - command
@@ -248,7 +250,7 @@ def twin_ends(command: np.ndarray, tolerance: float) -> np.ndarray:
 @settings(max_examples=5, derandomize=True)
 @given(seed=st.integers(0, 10**6), tolerance_um=st.sampled_from([2.0, 5.0]))
 @pytest.mark.parametrize("shaped", [False, True])
-def test_twin(shaped: bool, seed: int, tolerance_um: float) -> None:
+def test_the_fit_agrees_with_plain_python(shaped: bool, seed: int, tolerance_um: float) -> None:
     command = curvy(seed, 60, 60)
     plant = one_mode(45.0, 0.1) if shaped else SILENT
     segments = fit(command, 1e-3 * tolerance_um, plant)

@@ -42,7 +42,7 @@ def timeline(piece: Piece, rest_s: float = 0.0123, **extra: float) -> Timeline:
     return build_timeline(piece.phases, groups, durations, DT_S, **extra)
 
 
-def test_groups(piece: Piece) -> None:
+def test_rows_are_grouped_into_stretches_and_rests(piece: Piece) -> None:
     found = [(g.first, g.last, g.rest, g.before_z) for g in group_rows(piece.phases)]
     assert found == [
         (0, 1, False, False),
@@ -55,7 +55,9 @@ def test_groups(piece: Piece) -> None:
 
 @settings(max_examples=40)
 @given(rest_s=st.floats(1e-4, 0.3), lead=st.sampled_from([0.0, 0.02]), tail=st.floats(0, 0.05))
-def test_layout(piece: Piece, rest_s: float, lead: float, tail: float) -> None:
+def test_rests_start_on_the_grid_and_last_as_told(
+    piece: Piece, rest_s: float, lead: float, tail: float
+) -> None:
     line = timeline(piece, rest_s, lead_s=lead, tail_s=tail)
     p = piece.phases
     duration = p.accel_s + p.cruise_s + p.decel_s

@@ -363,7 +363,9 @@ def test_hardly_a_move_between_two_rests(pipeline: Pipeline, length: str) -> Non
     assert b"stream on" in written
 
 
-def test_stamps(pipeline: Pipeline, machine: Machine) -> None:
+def test_a_written_file_begins_and_ends_with_its_stamp(
+    pipeline: Pipeline, machine: Machine
+) -> None:
     lines = pipeline(HEAD + ROUND + "M84").splitlines()
     assert b"M84" in lines
     assert lines[0].startswith(b"; Processed by stillpath ")

@@ -258,7 +258,7 @@ def test_a_full_disk(running: Running, part: Path, tmp_path: Path):
     assert_untouched(part, content)
 
 
-def test_keys(running: Running, part: Path, tmp_path: Path):
+def test_wrong_keys_are_refused_and_never_shown(running: Running, part: Path, tmp_path: Path):
     arguments = running.odd("key")
     for wrong in ((), ("--key", "guessed")):
         done = post(*arguments, *wrong, part, home=tmp_path)

@@ -38,7 +38,7 @@ PRINTED = {
 
 
 @pytest.mark.parametrize("name", builtin_loops())
-def test_library(name: str) -> None:
+def test_built_in_loops_are_consistent_and_stable(name: str) -> None:
     spec = load_loop(name)
     assert spec.name == name
     assert spec.source
@@ -109,7 +109,7 @@ def test_variation_is_gain_and_delay(gain: float, delay: float) -> None:
     assert found == pytest.approx(gain * np.exp(-2j * np.pi * f * delay * loop.dt_s), abs=1e-3)
 
 
-def test_refusals(tmp_path: Path) -> None:
+def test_loops_that_cannot_be_say_why(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match="strictly proper"):
         Loop((1.0, 0.2), (1.0, -0.5), 1e-3)
     with pytest.raises(ModelError, match="unstable"):

@@ -82,7 +82,7 @@ def learnt_error(learnt: RippleTable, true: RippleTable) -> float:
 
 
 class TestDocument:
-    def test_deviation(self) -> None:
+    def test_the_deviation_is_the_sum_of_the_harmonics(self) -> None:
         s = np.array([0.0, 0.5, 1.3])
         expected = sum(
             1e-3 * a * np.sin(np.pi * h * s + math.radians(p))
@@ -133,7 +133,9 @@ class TestLearning:
 
     @pytest.mark.parametrize("kind", ["constant", "ramp", "stop and go"])
     @pytest.mark.parametrize("side", ["input", "output"])
-    def test_positions(self, kind: str, side: RippleSide) -> None:
+    def test_ripple_is_learnt_from_positions_with_honest_deviations(
+        self, kind: str, side: RippleSide
+    ) -> None:
         command = drive(kind)
         t, y = driven(command, table(side), side)
         noise = np.random.default_rng(1).normal(scale=0.01, size=len(t))
@@ -284,7 +286,7 @@ class TestUpdate:
             update_ripple(few, many)
 
     @pytest.mark.parametrize("gain", [0.0, 1.5])
-    def test_gain(self, gain: float) -> None:
+    def test_gains_outside_0_to_1_are_refused(self, gain: float) -> None:
         with pytest.raises(ModelError, match="gain"):
             update_ripple(ripple(), ripple(), gain=gain)
 

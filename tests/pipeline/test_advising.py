@@ -30,9 +30,9 @@ from stillpath.pipeline.advising.inserting import MARK
 from stillpath.pipeline.advising.removing import remove_advice
 from stillpath.pipeline.advising.trials import Trial
 from stillpath.pipeline.compensate import compensate_file
+from stillpath.pipeline.file_dialect import dialect_for
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.pacing.samples import take_samples
-from stillpath.pipeline.reading import dialect_for
 from stillpath.pipeline.result import Result
 from stillpath.pipeline.simulate import simulate_file
 from stillpath.simulation.machine_response import MachineStream

@@ -72,7 +72,7 @@ def check_file(original: bytes, written: bytes, machine: Machine) -> None:
 
 
 @pytest.mark.parametrize("name", ["ender3", "generic-corexy"])
-def test_example(tmp_path: Path, cache: Path, name: str) -> None:
+def test_the_example_rings_a_quarter_as_much(tmp_path: Path, cache: Path, name: str) -> None:
     data = tagged(b"".join(EXAMPLE.read_bytes().splitlines(keepends=True)[:1200]))
     result, written = compensated(data, tmp_path, cache, name)
     machine = load_machine(name)

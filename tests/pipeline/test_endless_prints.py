@@ -35,7 +35,9 @@ FILES = {
         ("move", "plan"),
     ],
 )
-def test_refused(tmp_path: Path, cache: Path, name: str, method: str) -> None:
+def test_endless_prints_are_refused_and_leave_no_file(
+    tmp_path: Path, cache: Path, name: str, method: str
+) -> None:
     text, message = FILES[name]
     source, target = tmp_path / "in.gcode", tmp_path / "out"
     source.write_text(text)

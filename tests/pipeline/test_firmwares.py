@@ -46,7 +46,9 @@ def body(kind: str) -> bytes:
         ("reprapfirmware", b" M204 P700"),
     ],
 )
-def test_compensated(kind: str, beside_a_rest: bytes, tmp_path: Path, cache: Path) -> None:
+def test_the_written_file_beats_the_shaper_and_keeps_the_state(
+    kind: str, beside_a_rest: bytes, tmp_path: Path, cache: Path
+) -> None:
     machine = ender3_with(kind)
     hop = b"G1 Z5.4 F600"
     data = tagged(body(kind).replace(hop, hop + beside_a_rest))

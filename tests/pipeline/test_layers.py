@@ -339,7 +339,7 @@ def test_tiles_hold_what_was_measured(seed: int, count: int) -> None:
 
 @settings(max_examples=20)
 @given(seed=st.integers(0, 2**32 - 1))
-def test_twin(seed: int) -> None:
+def test_the_compiled_loop_agrees_with_plain_python(seed: int) -> None:
     """The compiled loop and the same lines run by Python."""
     rng = np.random.default_rng(seed)
     moves = made_moves(rng, 30)

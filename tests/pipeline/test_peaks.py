@@ -10,7 +10,7 @@ from stillpath.pipeline.measuring._peak_kernels import peaks, speed_steps
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 50])
-def test_peaks(n: int) -> None:
+def test_peaks_agree_with_plain_numpy(n: int) -> None:
     command = np.random.default_rng(n).normal(size=(4, n))
     steps = np.diff(command[:2])
     step_mm, bend_mm = peaks(command)

@@ -78,7 +78,7 @@ def test_shifted_copies_are_the_shaped_command() -> None:
     assert trial.rms("ei", 40, 22, 10**6) * 1e3 == pytest.approx(long_way.contour_rms_um, rel=1e-6)
 
 
-def test_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_machine_is_tuned_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     calls = []
 
     def tune(*_: object) -> BestShaper:

@@ -49,7 +49,9 @@ def pushed(
 @pytest.mark.parametrize(
     ("compensated", "friction_mm"), [(True, None), (False, None), (True, 0.01)]
 )
-def test_parts(ender: Machine, compensated: bool, friction_mm: float | None) -> None:
+def test_parts_join_to_the_response_of_the_whole_motion(
+    ender: Machine, compensated: bool, friction_mm: float | None
+) -> None:
     update = {"friction_mm": friction_mm}
     axes = {a: plants.model_copy(update=update) for a, plants in ender.axes.items()}
     ender = ender.model_copy(update={"axes": axes})

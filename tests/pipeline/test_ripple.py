@@ -68,7 +68,7 @@ def test_ripple_that_the_limits_leave_no_room_for_is_told(
     assert [w.partition(" is not compensated")[0] for w in found] == said
 
 
-def test_methods() -> None:
+def test_ripple_is_laid_over_any_method_but_is_none_itself() -> None:
     for method in ("fbf+ripple", "none+ripple", "zpetc+ripple", "shaper:mzv+ripple"):
         assert Options(method=method).method == method
     with pytest.raises(ValidationError):

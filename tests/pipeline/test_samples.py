@@ -9,8 +9,8 @@ import pytest
 
 from stillpath.gcode.pacing import AS_SLICED, FirstLayer
 from stillpath.models.store import load_machine
+from stillpath.pipeline.file_dialect import dialect_for
 from stillpath.pipeline.pacing.samples import FileSamples, take_samples
-from stillpath.pipeline.reading import dialect_for
 
 MACHINE = load_machine("ender3")
 PURGE = "G28\nM83\nG1 Z.3 F600\nG1 X5 Y5 F6000\nG1 Y80 E8 F1500\n"

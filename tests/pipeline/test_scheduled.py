@@ -174,7 +174,7 @@ def test_prediction_follows_too(tmp_path: Path, cache: Path) -> None:
     assert gains[-1] > 1.2
 
 
-def test_heights(tmp_path: Path, cache: Path) -> None:
+def test_plants_follow_the_height(tmp_path: Path, cache: Path) -> None:
     spec = load_machine("generic-bedslinger").axes["x"].nominal
     nodes = tuple(GridNode(z_mm=z, plant=spec.scaled(f, 1.0)) for z, f in ((0, 1.0), (2, 0.8)))
     machine = bedslinger(None).model_copy(

@@ -12,8 +12,8 @@ from stillpath.models.machine import Machine
 from stillpath.models.plants import ParametricMembers, PlantSetSpec, PlantSpec, TfSpec
 from stillpath.models.ripple import MachineRipple
 from stillpath.models.store import load_machine
+from stillpath.pipeline.file_dialect import dialect_for
 from stillpath.pipeline.file_motion import TextMotion
-from stillpath.pipeline.reading import dialect_for
 from stillpath.simulation.printers.bodies import STEP_S, Bodies, Element, Friction
 from stillpath.simulation.printers.resonance_test import Accelerometer, Record
 

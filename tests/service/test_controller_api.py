@@ -69,7 +69,7 @@ def test_machine_in_the_body(client: TestClient) -> None:
         ({"method": "magic"}, "magic", None),
     ],
 )
-def test_refusals(
+def test_a_refused_design_says_why(
     client: TestClient, change: dict[str, Any], words: str, reason: str | None
 ) -> None:
     answer = client.post(WHERE, json=FMSDOB | change)

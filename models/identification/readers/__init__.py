@@ -1,9 +1,9 @@
 """Readers of measurement and model files; see `read_measurements`."""
 
 from stillpath.models.identification.readers.assumed_test import (
+    AssumedTest,
+    assumed_test,
     date_in_name,
-    excitation_for,
-    excitation_notes,
 )
 from stillpath.models.identification.readers.reading import read_content, read_measurements
 from stillpath.models.identification.readers.settings import (
@@ -13,11 +13,11 @@ from stillpath.models.identification.readers.settings import (
 )
 
 __all__ = [
+    "AssumedTest",
     "ReadSettings",
+    "assumed_test",
     "date_in_name",
     "direction_of",
-    "excitation_for",
-    "excitation_notes",
     "read_content",
     "read_measurements",
     "tested_axis",

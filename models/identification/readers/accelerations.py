@@ -16,7 +16,7 @@ from stillpath.models.identification.readers.checks import (
     sensor_axes,
 )
 from stillpath.models.identification.readers.lost_samples import restored
-from stillpath.models.identification.readers.settings import NO_TEST, ReadSettings
+from stillpath.models.identification.readers.settings import ReadSettings
 from stillpath.models.identification.readers.spikes import sound_samples
 from stillpath.models.identification.readers.tables import MOST_ROWS, Table
 from stillpath.models.identification.types import AccelerationLog
@@ -101,7 +101,8 @@ def read_m956(table: Table, axis: str | None, settings: ReadSettings) -> Acceler
         accel[:, "xyz".index(name)] = values[:, i] * _UNITS[settings.acceleration_unit or "g"]
     columns = dict(zip("xyz", accel.T, strict=True))
     notes = _notes(columns, table, axis, settings)
-    return AccelerationLog(values[:, 0] / rate_hz, accel, axis, table.source, (NO_TEST, *notes))
+    time_s = values[:, 0] / rate_hz
+    return AccelerationLog(time_s, accel, axis, table.source, notes, may_hold_test=False)
 
 
 def _unit(values: Array) -> str:

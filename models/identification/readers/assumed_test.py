@@ -12,7 +12,7 @@ from stillpath.models.identification.readers.slow_sweep import log_sweeps, table
 from stillpath.models.identification.readers.table_range import end_of_test, start_of_test
 from stillpath.models.identification.types import AccelerationLog, Excitation, Spectrum
 
-__all__ = ["date_in_name", "excitation_for", "excitation_notes"]
+__all__ = ["AssumedTest", "assumed_test", "date_in_name"]
 
 _NEW_TEST = date(2024, 12, 1)
 _NEW = Excitation(direction=(1.0, 0.0))
@@ -35,9 +35,16 @@ test of before 2024-12 lasts 128.3 s, that of since and Kalico's 130 s."""
 _DATE = re.compile(r"(?<!\d)(20\d\d)[-_]?(\d\d)[-_]?(\d\d)(?!\d)")
 
 
-def excitation_for(
+class AssumedTest(NamedTuple):
+    """The test that made a file, and notes on what was assumed of it for lack of information."""
+
+    excitation: Excitation
+    notes: tuple[str, ...]
+
+
+def assumed_test(
     measurement: AccelerationLog | Spectrum, settings: ReadSettings | None = None
-) -> Excitation:
+) -> AssumedTest:
     """Return the firmware's resonance test: the settings first, then the file, then defaults.
 
     Defaults of klippy/extras/resonance_tester.py: before 2024-12 from 5 to 133.33 Hz with
@@ -50,32 +57,7 @@ def excitation_for(
     ModelError
         If the tested axis is not stated, or does not lie in the plane.
     """
-    return _resolved(measurement, settings or ReadSettings()).excitation
-
-
-def excitation_notes(
-    measurement: AccelerationLog | Spectrum, settings: ReadSettings | None = None
-) -> tuple[str, ...]:
-    """Return notes on what `excitation_for` assumed for lack of information."""
-    return _resolved(measurement, settings or ReadSettings()).notes
-
-
-def date_in_name(name: str) -> date | None:
-    """Return the date in a file name such as resonances_x_20211217_070942.csv, if it has one."""
-    for found in _DATE.finditer(name):
-        try:
-            return date(*(int(part) for part in found.groups()))
-        except ValueError:
-            continue
-    return None
-
-
-class _Resolved(NamedTuple):
-    excitation: Excitation
-    notes: tuple[str, ...]
-
-
-def _resolved(measurement: AccelerationLog | Spectrum, settings: ReadSettings) -> _Resolved:
+    settings = settings or ReadSettings()
     axis = settings.axis or measurement.axis
     if axis is None:
         raise ModelError(
@@ -100,7 +82,17 @@ def _resolved(measurement: AccelerationLog | Spectrum, settings: ReadSettings) -
     ]
     if assumed:
         notes.append(f"assumed {', '.join(assumed)}: the defaults of Klipper {era}")
-    return _Resolved(Excitation(direction, out_and_back=False, **values), tuple(notes))
+    return AssumedTest(Excitation(direction, out_and_back=False, **values), tuple(notes))
+
+
+def date_in_name(name: str) -> date | None:
+    """Return the date in a file name such as resonances_x_20211217_070942.csv, if it has one."""
+    for found in _DATE.finditer(name):
+        try:
+            return date(*(int(part) for part in found.groups()))
+        except ValueError:
+            continue
+    return None
 
 
 def _known(

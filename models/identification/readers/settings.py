@@ -12,19 +12,18 @@ from pydantic import Field, field_validator, model_validator
 from stillpath.models.document import Document, NonNegative, Positive
 from stillpath.models.errors import ModelError
 from stillpath.models.friction import Guides
-from stillpath.models.identification.types import Axis, Measurement
+from stillpath.models.identification.types import AccelerationLog, Axis, Measurement
 
-__all__ = ["NO_TEST", "ReadSettings", "direction_of", "tested_axis"]
+__all__ = ["ReadSettings", "direction_of", "tested_axis"]
 
 Column = str | Annotated[int, Field(ge=0)]
 """By name, or counted from 0."""
 
-NO_TEST = (
+_NO_TEST = (
     "RepRapFirmware has no resonance test of its own, and its log does not say what moved: type "
     "the frequencies in (machines from-config, --fx and --fy) and let verify read the log of a "
     "ring-test, or record command and acceleration together"
 )
-"""Note of an M956 log."""
 _DIAGONAL = re.compile(r"-?\d+(\.\d+)?,-?\d+(\.\d+)?(,-?\d+(\.\d+)?)?")
 _DAY = re.compile(r"\d{4}-\d\d-\d\d")
 
@@ -145,8 +144,8 @@ def tested_axis(measurement: Measurement, settings: ReadSettings) -> Axis:
     ModelError
         If nothing says it, the test moved both axes at once, or there was none.
     """
-    if NO_TEST in measurement.notes:
-        raise ModelError(f"{measurement.source}: {NO_TEST}")
+    if isinstance(measurement, AccelerationLog) and not measurement.may_hold_test:
+        raise ModelError(f"{measurement.source}: {_NO_TEST}")
     text = settings.axis or measurement.axis
     if text is None:
         raise ModelError(

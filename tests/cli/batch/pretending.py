@@ -6,7 +6,7 @@ import os
 import threading
 import time
 
-from stillpath.cli.batch.local_workers import Failure, Made, Stopped, Task, failure_of
+from stillpath.cli.batch.local_workers import Failure, FileResult, FileTask, Stopped, failure_of
 from stillpath.cli.batch.output import Figures
 from stillpath.gcode.errors import GcodeError
 
@@ -20,7 +20,7 @@ class PretendedWorker:
 
     tries = 0
 
-    def do(self, task: Task, stopping: threading.Event) -> Made:
+    def do(self, task: FileTask, stopping: threading.Event) -> FileResult:
         PretendedWorker.tries += 1
         word = task.source.read_text().split()[0]
         deadline = time.monotonic() + (600 if word == "slow" else DELAY_S)
@@ -38,7 +38,7 @@ class PretendedWorker:
         figures = Figures(
             original_s=100, written_s=100.1, before_um=20, shaper_um=8, after_um=1, put_back=0
         )
-        return Made(figures, 0.5)
+        return FileResult(figures, 0.5)
 
     def end(self) -> None:
         pass

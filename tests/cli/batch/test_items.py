@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from stillpath.cli.arguments import Refused
+from stillpath.cli.arguments import CommandRefused
 from stillpath.cli.batch.items import Group, items_of, parse_map, result_name
 from stillpath.models.errors import ModelError
 
@@ -54,14 +54,14 @@ def test_a_folder_within_the_output_is_refused(tmp_path, output):
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(Refused, match=r"nothing\.gcode does not exist"):
+    with pytest.raises(CommandRefused, match=r"nothing\.gcode does not exist"):
         items_of([tmp_path / "nothing.gcode"], Group(("m",)), output=tmp_path / "out")
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="makes a named pipe")
 def test_pipes_are_refused(tmp_path):
     os.mkfifo(tmp_path / "pipe.gcode")
-    with pytest.raises(Refused, match="is a pipe or a device"):
+    with pytest.raises(CommandRefused, match="is a pipe or a device"):
         items_of([tmp_path / "pipe.gcode"], Group(("m",)), output=tmp_path / "out")
 
 

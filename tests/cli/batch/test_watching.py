@@ -22,7 +22,7 @@ from stillpath.applications.machines.store import MachineStore
 from stillpath.cli.batch.items import Group, print_files
 from stillpath.cli.batch.output import Outcome, OutputFolder
 from stillpath.cli.batch.watching import Watcher
-from stillpath.cli.batch.worker_pool import LocalPool, worker_pool
+from stillpath.cli.batch.worker_pool import LocalBackend, worker_pool
 from stillpath.pipeline.options import Options
 from tests.cli.batch.pretending import PretendedWorker
 from tests.service.machines import make_machine, with_accel
@@ -68,7 +68,7 @@ def watching(
     options = Options()
     with (
         OutputFolder.opened(output or folder.parent / "out") as kept,
-        worker_pool(LocalPool(machines, options, 2), kept, options, 2) as made,
+        worker_pool(LocalBackend(machines, options, 2), kept, options, 2) as made,
     ):
         group = Group(tuple(machine.split(",")))
         yield Watching(Watcher(folder, group, made, kept, settle_s=2.0, tell=told.append), told)

@@ -45,7 +45,7 @@ def there_and_back(quantum_mm: float = 0.5e-3) -> np.ndarray:
 
 
 class TestPd:
-    def test_gains(self) -> None:
+    def test_pd_gains_are_those_of_the_paper(self) -> None:
         kp, kv = inertia_pd(1.0, DT, 100.0, 0.85)
         assert (kp, kv) == (pytest.approx(0.001872, abs=1e-6), pytest.approx(0.05065, abs=1e-5))
 
@@ -160,7 +160,7 @@ class TestPrefilter:
         assert [part.kind for part in made.coefficients] == ["fir", "sos", "fir"]
 
 
-def test_four_stages() -> None:
+def test_observer_and_prefilters_each_reduce_the_error() -> None:
     """PD, with observer, with ZPETC, with FIR: 600 um without feedforward, chatter gone with it."""
     y_d = there_and_back()
     observer = design_disturbance_observer(LOOPS, 150.0).blocks

@@ -163,7 +163,7 @@ def test_detuning_limits_the_depth() -> None:
         design_q(SLOW.nominal(), [1500.0], trim=Trim(detuning=1.5))
 
 
-def test_fixed_zeros() -> None:
+def test_q_has_the_zeros_that_were_fixed() -> None:
     zeros = [(1.0, 0.0), (1.0, 5000.0), (0.98, 300.0)]
     q = design_q(SLOW.nominal(), [1500.0], bandwidth_hz=None, trim=Trim(zeros=zeros))
     assert len(q.taps) == 2 + 1 + 1 + 2
@@ -189,7 +189,7 @@ def test_width_after_a_band_pass() -> None:
     assert widths["hermite", True] == pytest.approx(365, abs=2)
 
 
-def test_waterbed() -> None:
+def test_log_sensitivity_integrates_to_its_unstable_zeros() -> None:
     """(18): ln|1 - PQ| integrates to pi times the logarithms of its unstable zeros."""
     loop = SLOW.nominal()
     made = fmsdob(SLOW.loops(), [1500.0], bandwidth_hz=300.0)
@@ -209,7 +209,7 @@ def test_waterbed() -> None:
     assert np.trapezoid(values, w) == pytest.approx(np.pi * np.log(outside).sum(), abs=1e-3)
 
 
-def test_band_pass() -> None:
+def test_the_band_pass_is_1_at_its_centres_with_the_stated_slopes() -> None:
     band = LatticeBandPass.at((2000, 4000, 7000), (40, 40, 40), 2.5e-5)
     w = np.array(band.centres)
     assert band.response(w) == pytest.approx(1.0, abs=1e-9)
@@ -245,7 +245,7 @@ def test_inverse_dob_matches_and_refuses() -> None:
     assert refused.value.reason == "inverse"
 
 
-def test_small_gain() -> None:
+def test_uncertainty_beyond_the_small_gain_limit_is_refused() -> None:
     """Refused where |Delta| >= 1/|T|, with the frequency."""
     loops = SLOW.loops()
     limit = fmsdob(loops, [1500.0]).prediction.min_inverse_t
@@ -306,7 +306,7 @@ def test_blocked_target() -> None:
         design_q(loop, [0.6 / (2 * np.pi * 1e-3)])
 
 
-def test_documents() -> None:
+def test_json_and_header_hold_the_designed_taps() -> None:
     made = fmsdob(SLOW.loops(), [1500.0])
     document = json.loads(json.dumps(made.to_dict(curves=True)))
     assert document["method"] == "fmsdob"

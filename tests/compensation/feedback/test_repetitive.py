@@ -74,7 +74,7 @@ class TestPublished:
         factor = multirate_factor(NOMINAL, InternalModel(40, 0.999), FAST, 3, f_hz)
         assert three_sigma(NOMINAL.servo(f_hz), factor) == pytest.approx(0.0053, abs=5e-5)
 
-    def test_margins(self) -> None:
+    def test_margins_are_those_of_the_paper(self) -> None:
         # At whole Hz, as published; between them the last one goes down to -11.3 dB. The scaled
         # T0 gives 0.08 dB more than the printed one (-2.15, -2.91, -10.85).
         f_hz = np.arange(5.0, 7999.0) + 1e-5

@@ -20,7 +20,7 @@ from stillpath.models.identification.synthetic import (
     write_raw_data,
 )
 from stillpath.models.identification.types import AccelerationLog, Excitation, Spectrum
-from stillpath.models.plants import PairsSpec, PlantSpec, PolePair
+from stillpath.models.plants import PairsSpec, PlantSpec, PolePair, frequency_response
 from tests.models.identification.klipper_files import write_resonances
 
 __all__ = [
@@ -34,6 +34,7 @@ __all__ = [
     "TAZ",
     "along",
     "broken",
+    "late_by_less",
     "one_mode",
     "quick_log",
     "quick_raw",
@@ -75,6 +76,15 @@ def quick_log(
     )
     options = {"sensor": QUICK_SENSOR, "rng": np.random.default_rng(seed)} | options
     return simulate_log(truth, test, **options)
+
+
+def late_by_less(log: AccelerationLog, plant: PairsSpec, share: float) -> AccelerationLog:
+    """Return the log of an axis whose phase is only a share of its plant's, as under friction."""
+    accel = np.array(log.accel_mm_s2)
+    f_hz = np.fft.rfftfreq(len(accel), float(np.median(np.diff(log.time_s))))
+    turned = np.exp(1j * (share - 1) * np.angle(frequency_response(plant, f_hz)))
+    spectra = turned[:, None] * np.fft.rfft(accel, axis=0)
+    return replace(log, accel_mm_s2=np.fft.irfft(spectra, len(accel), axis=0))
 
 
 def quick_raw(

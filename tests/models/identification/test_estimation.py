@@ -20,7 +20,7 @@ from stillpath.models.identification.estimation import (
     plateau_gain,
 )
 from stillpath.models.identification.local_model import Transformed, local_response
-from stillpath.models.identification.readers import ReadSettings, excitation_for, read_measurements
+from stillpath.models.identification.readers import ReadSettings, assumed_test, read_measurements
 from stillpath.models.identification.synthetic import ADXL345, Sensor, simulate_log, write_raw_data
 from stillpath.models.identification.types import (
     AccelerationLog,
@@ -139,7 +139,7 @@ def test_a_written_log_gives_the_response_it_was_made_with(tmp_path: Path) -> No
     path = write_raw_data(measured(MODES, across), tmp_path)
     (log,) = read_measurements(path)
     assert isinstance(log, AccelerationLog)
-    excitation = excitation_for(log, ReadSettings(f_end_hz=25.0))
+    excitation = assumed_test(log, ReadSettings(f_end_hz=25.0)).excitation
     assert excitation == across
     found = estimate_response(log, excitation)
     truth = frequency_response(MODES, found.f_hz)

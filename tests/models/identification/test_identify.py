@@ -58,6 +58,7 @@ from tests.models.identification.recordings import (
     QUICK_SETTINGS,
     SWEEPING,
     along,
+    late_by_less,
     one_mode,
     quick_log,
     quick_raw,
@@ -792,15 +793,6 @@ def test_what_no_model_explains_is_refused() -> None:
     )
     with pytest.raises(ModelError, match=r"noise.csv: no stable model .* explains this"):
         identify([Measured(response)])
-
-
-def late_by_less(log: AccelerationLog, plant: PairsSpec, share: float) -> AccelerationLog:
-    """Return the log of an axis whose phase is only a share of its plant's, as under friction."""
-    accel = np.array(log.accel_mm_s2)
-    f_hz = np.fft.rfftfreq(len(accel), float(np.median(np.diff(log.time_s))))
-    turned = np.exp(1j * (share - 1) * np.angle(frequency_response(plant, f_hz)))
-    spectra = turned[:, None] * np.fft.rfft(accel, axis=0)
-    return replace(log, accel_mm_s2=np.fft.irfft(spectra, len(accel), axis=0))
 
 
 @pytest.mark.slow

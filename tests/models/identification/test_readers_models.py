@@ -187,7 +187,7 @@ def test_dc_gain_far_off_needs_a_word() -> None:
         ('{"a":' * 100_000, "not a JSON model"),
     ],
 )
-def test_refusals(document: Any, message: str) -> None:
+def test_models_that_cannot_be_read_say_why(document: Any, message: str) -> None:
     with pytest.raises(ModelError, match=message) as caught:
         read(document)
     assert str(caught.value).startswith("model.json: ")

@@ -16,10 +16,9 @@ from stillpath.models.identification.excitation import (
 )
 from stillpath.models.identification.readers import (
     ReadSettings,
+    assumed_test,
     date_in_name,
     direction_of,
-    excitation_for,
-    excitation_notes,
 )
 from stillpath.models.identification.spectrum_model import moved_most
 from stillpath.models.identification.synthetic import Sensor
@@ -51,8 +50,8 @@ def test_defaults_by_date(
     source: str, firmware: date | None, expected: Excitation, words: str
 ) -> None:
     settings = ReadSettings(firmware_date=firmware)
-    assert excitation_for(spectrum(source), settings) == expected
-    (note,) = excitation_notes(spectrum(source), settings)
+    found, (note,) = assumed_test(spectrum(source), settings)
+    assert found == expected
     assert words in note
     assert f"accel_per_hz {expected.accel_per_hz_mm_s:g}" in note
 
@@ -80,8 +79,8 @@ def test_raw_logs_tell_which_test_they_are_of(
     log = quick_log("x", test=test, sensor=Sensor(rate_hz=500.0, noise_mm_s2=80.0, gain=0.88))
     log = replace(log, source=f"raw_data_x_{name}.csv")
     given = ReadSettings.model_validate(settings)
-    assert excitation_for(log, given) == (OLD if test is LEGACY else NEW)
-    (note,) = excitation_notes(log, given)
+    found, (note,) = assumed_test(log, given)
+    assert found == (OLD if test is LEGACY else NEW)
     assert words in note
 
 
@@ -90,18 +89,19 @@ def test_a_log_without_slow_sweep_of_130_s_ends_at_135_hz() -> None:
     test = replace(LEGACY, f_end_hz=135.0, out_and_back=False)
     log = quick_log("x", test=test, lead_s=0.0, tail_s=0.0)
     log = replace(log, source="raw_data_x_20260601_101010.csv")
-    assert excitation_for(log) == replace(OLD, f_end_hz=135.0)
-    (note,) = excitation_notes(log)
+    found, (note,) = assumed_test(log)
+    assert found == replace(OLD, f_end_hz=135.0)
     assert "the log is 130 s long, as Kalico's test is to 135 Hz" in note
     # The length of a test that was stated otherwise tells nothing.
-    assert excitation_for(log, ReadSettings(hz_per_s=2.0)) == replace(OLD, hz_per_s=2.0)
-    assert excitation_for(log, ReadSettings(f_end_hz=120.0)) == replace(OLD, f_end_hz=120.0)
+    assert assumed_test(log, ReadSettings(hz_per_s=2.0)).excitation == replace(OLD, hz_per_s=2.0)
+    shorter = assumed_test(log, ReadSettings(f_end_hz=120.0)).excitation
+    assert shorter == replace(OLD, f_end_hz=120.0)
 
 
 def test_a_log_that_hardly_moves_tells_nothing() -> None:
     log = quick_log("x", test=LEGACY, sensor=Sensor(rate_hz=500.0, gain=0.02))
     log = replace(log, source="raw_data_x_20250601_101010.csv")
-    assert excitation_for(log) == NEW
+    assert assumed_test(log).excitation == NEW
 
 
 def simulated_table(
@@ -131,28 +131,28 @@ def test_tables_tell_which_test_they_are_of(
 ) -> None:
     """Printers of 2026 with a Klipper of 2022, and Kalico, do not sweep slowly."""
     table = simulated_table(test, f"resonances_x_{name}.csv", sets=sets)
-    assert excitation_for(table) == test
-    (note,) = excitation_notes(table)
+    found, (note,) = assumed_test(table)
+    assert found == test
     assert words in note
 
 
 def test_tables_cut_at_5_hz_are_of_a_klipper_that_does_not_sweep() -> None:
     table = simulated_table(NEW, "calibration_data_x_20260601.csv")
     cut = replace(table, f_hz=table.f_hz[4:], psd={"x": table.psd["x"][4:]})
-    assert excitation_for(cut) == OLD
+    assert assumed_test(cut).excitation == OLD
 
 
 def test_kalico_does_not_sweep_slowly() -> None:
     test = replace(OLD, accel_per_hz_mm_s=60.0, f_end_hz=135.0)
     table = simulated_table(test, "resonances_x_20260601.csv", accel_per_hz_mm_s=60.0)
-    told = excitation_for(table)
+    told = assumed_test(table).excitation
     assert (told.accel_per_hz_mm_s, told.sweeping_accel_mm_s2) == (60.0, 0.0)
 
 
 def test_strong_shaking_is_no_slow_sweep() -> None:
     test = replace(OLD, accel_per_hz_mm_s=300.0)
     table = simulated_table(test, "resonances_x_20230601.csv")
-    assert excitation_for(table).sweeping_accel_mm_s2 == 0.0
+    assert assumed_test(table).excitation.sweeping_accel_mm_s2 == 0.0
 
 
 @pytest.mark.parametrize(
@@ -164,12 +164,12 @@ def test_range_by_where_the_table_ends(max_freq: float, last_hz: float, expected
     f_hz = np.arange(0.0, last_hz + 1.0, 1.0) + (last_hz % 1.0)
     table = Spectrum(f_hz, {"x": np.ones(len(f_hz))}, "x", "resonances_x_20260101.csv")
     assert table.f_hz[-1] == pytest.approx(last_hz, abs=1.0)
-    assert excitation_for(table).f_end_hz == pytest.approx(expected, abs=0.7)
-    told = any("so max_freq is" in note for note in excitation_notes(table))
+    assert assumed_test(table).excitation.f_end_hz == pytest.approx(expected, abs=0.7)
+    told = any("so max_freq is" in note for note in assumed_test(table).notes)
     assert told == (max_freq != 135)
     old = ReadSettings(firmware_date=date(2023, 1, 1))
-    assert excitation_for(table, old).f_end_hz == pytest.approx(10000 / 75)
-    assert excitation_for(table, ReadSettings(f_end_hz=90)).f_end_hz == 90.0
+    assert assumed_test(table, old).excitation.f_end_hz == pytest.approx(10000 / 75)
+    assert assumed_test(table, ReadSettings(f_end_hz=90)).excitation.f_end_hz == 90.0
 
 
 def test_a_table_wider_than_its_test_keeps_the_default() -> None:
@@ -181,8 +181,8 @@ def test_a_table_wider_than_its_test_keeps_the_default() -> None:
         (265.0, Spectrum(f_hz, {"x": np.square(f_hz)}, "x", "resonances_x_20260101.csv")),
     ):
         settings = ReadSettings(sweeping_accel_mm_s2=400.0)
-        assert excitation_for(table, settings).f_end_hz == max_freq
-        notes = excitation_notes(table, settings)
+        assert assumed_test(table, settings).excitation.f_end_hz == max_freq
+        notes = assumed_test(table, settings).notes
         assert any("so max_freq is" in note for note in notes) == (max_freq == 265.0)
         assert any("max_freq 135" in note for note in notes) == (max_freq == 135.0)
 
@@ -197,11 +197,11 @@ def test_a_test_that_ended_early_in_a_table_up_to_200_hz(max_freq: float) -> Non
     gain = np.abs((1 + 2j * zeta * ratio) / (1 - ratio**2 + 2j * zeta * ratio)) ** 2
     rings = replace(table, psd={"x": table.psd["x"] * gain})
     for one in (table, rings):
-        assert excitation_for(one) == test
-        assert any("max_freq is taken to be" in note for note in excitation_notes(one))
+        assert assumed_test(one).excitation == test
+        assert any("max_freq is taken to be" in note for note in assumed_test(one).notes)
     stated = ReadSettings(f_end_hz=130.0)
-    assert excitation_for(rings, stated).f_end_hz == 130.0
-    assert not any("is taken" in note for note in excitation_notes(rings, stated))
+    assert assumed_test(rings, stated).excitation.f_end_hz == 130.0
+    assert not any("is taken" in note for note in assumed_test(rings, stated).notes)
 
 
 @pytest.mark.parametrize("mode_hz", [38.0, 52.0, 71.0, 96.0])
@@ -213,22 +213,24 @@ def test_a_resonance_is_not_the_end_of_a_test(mode_hz: float, zero: float | None
     if zero is not None:
         gain *= 1 - (ratio / zero) ** 2 + 0.04j * ratio / zero
     rings = replace(table, psd={"x": table.psd["x"] * np.abs(gain) ** 2 + 1.0})
-    assert excitation_for(rings) == OLD
+    assert assumed_test(rings).excitation == OLD
 
 
 def test_settings_before_file_before_defaults() -> None:
     """Kalico writes accel_per_hz of printer.cfg, also of a test with another."""
     settings = ReadSettings(accel_per_hz_mm_s=90, f_end_hz=200, firmware_date=date(2023, 1, 1))
-    told = excitation_for(spectrum("a.csv", "1,-1", 100.0), settings)
+    told = assumed_test(spectrum("a.csv", "1,-1", 100.0), settings).excitation
     assert told.accel_per_hz_mm_s == 90.0
     assert told.f_end_hz == 200.0
     assert told.sweeping_accel_mm_s2 == 0.0
     np.testing.assert_allclose(told.direction, (np.sqrt(0.5), -np.sqrt(0.5)))
-    notes = excitation_notes(spectrum("a.csv", "x", 100.0), settings)
+    notes = assumed_test(spectrum("a.csv", "x", 100.0), settings).notes
     assert notes[0] == "accel_per_hz 90 was stated, 100 in the file does not count"
     unstated = settings.model_copy(update={"accel_per_hz_mm_s": None})
-    assert excitation_for(spectrum("a.csv", "x", 100.0), unstated).accel_per_hz_mm_s == 100.0
-    (note,) = excitation_notes(spectrum("a.csv", "x", 100.0), unstated)
+    assert (
+        assumed_test(spectrum("a.csv", "x", 100.0), unstated).excitation.accel_per_hz_mm_s == 100.0
+    )
+    (note,) = assumed_test(spectrum("a.csv", "x", 100.0), unstated).notes
     assert "accel_per_hz" not in note
     assert "f_end_hz" not in note
 
@@ -238,17 +240,17 @@ def test_nothing_assumed_when_everything_is_said() -> None:
         axis="y", accel_per_hz_mm_s=75, f_start_hz=5, f_end_hz=100, hz_per_s=1,
         sweeping_accel_mm_s2=0,
     )  # fmt: skip
-    assert excitation_notes(spectrum("a.csv", None), settings) == ()
-    assert excitation_for(spectrum("a.csv", None), settings).direction == (0.0, 1.0)
+    assert assumed_test(spectrum("a.csv", None), settings).notes == ()
+    assert assumed_test(spectrum("a.csv", None), settings).excitation.direction == (0.0, 1.0)
 
 
-def test_refusals() -> None:
+def test_settings_that_contradict_themselves_or_the_file_are_refused() -> None:
     with pytest.raises(ModelError, match=r"a\.csv: neither the file nor its name says which axis"):
-        excitation_for(spectrum("a.csv", None))
+        assumed_test(spectrum("a.csv", None))
     with pytest.raises(ModelError, match=r"'z' is not a direction of the plane; .* tests along Z"):
-        excitation_for(spectrum("a.csv", "z"))
+        assumed_test(spectrum("a.csv", "z"))
     with pytest.raises(ModelError, match="from 5 to 4 Hz"):
-        excitation_for(spectrum("a.csv"), ReadSettings(f_end_hz=4))
+        assumed_test(spectrum("a.csv"), ReadSettings(f_end_hz=4))
     for wrong in (
         {"axis": "w"},
         {"f_start_hz": 9, "f_end_hz": 8},
@@ -296,10 +298,10 @@ def test_a_table_tells_that_its_test_began_late(
     rings = replace(table, psd={"x": table.psd["x"] * gain + noise, "z": noise})
     given = ReadSettings.model_validate(settings)
     for one in (table, rings):
-        told = excitation_for(one, given)
+        told = assumed_test(one, given).excitation
         assert told.f_start_hz == settings.get("f_start_hz", test.f_start_hz)
         assert told.f_end_hz == pytest.approx(test.f_end_hz, abs=1.7)
-        warned = any("min_freq is taken to be" in note for note in excitation_notes(one, given))
+        warned = any("min_freq is taken to be" in note for note in assumed_test(one, given).notes)
         assert warned != bool(settings)
     assert moved_most(rings)[0] == "x"
     assert moved_most(rings)[1] > 0.99
@@ -317,4 +319,4 @@ def test_a_resonance_is_not_the_beginning_of_a_test(
     if zero is not None:
         gain *= 1 - (ratio / zero) ** 2 + 0.06j * ratio / zero
     rings = replace(table, psd={"x": table.psd["x"] * np.abs(gain) ** 2 + 1.0})
-    assert excitation_for(rings).f_start_hz == 5.0
+    assert assumed_test(rings).excitation.f_start_hz == 5.0

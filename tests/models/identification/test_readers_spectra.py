@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.readers import (
     ReadSettings,
-    excitation_for,
+    assumed_test,
     read_content,
     read_measurements,
 )
@@ -254,7 +254,7 @@ def test_every_measured_table_is_read(shared_dir: Path) -> None:
         assert isinstance(spectrum, Spectrum)
         assert list(spectrum.psd) == ["x", "y", "z", "xyz"]
         assert spectrum.axis == path.name.split("_")[1]
-        assert excitation_for(spectrum).f_end_hz == pytest.approx(10000 / 75)
+        assert assumed_test(spectrum).excitation.f_end_hz == pytest.approx(10000 / 75)
         written = np.loadtxt(path, delimiter=",", skiprows=1)
         np.testing.assert_allclose(spectrum.f_hz, written[:, 0], atol=0.0501)
         np.testing.assert_array_equal(spectrum.psd["xyz"], written[:, 4])

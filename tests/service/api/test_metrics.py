@@ -32,7 +32,7 @@ def figures(text: str) -> dict[tuple[str, frozenset[tuple[str, str]]], float]:
     }
 
 
-def test_figures(tmp_path: Path):
+def test_metrics_count_jobs_and_requests_by_route(tmp_path: Path):
     with opened(tmp_path) as client:
         assert client.get("/healthz").json()["status"] == "ok"
         assert client.get("/readyz").json()["status"] == "ok"

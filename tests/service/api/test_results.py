@@ -75,7 +75,7 @@ def test_the_last_bytes_and_if_range(client: TestClient, job: str):
         assert client.get(f"{job}/result", headers=headers).status_code == status
 
 
-def test_layers(client: TestClient, job: str):
+def test_layers_are_served_in_ranges_with_tags(client: TestClient, job: str):
     index = client.get(f"{job}/layers")
     assert len(index.json()["layers"]) == 2
     tag = index.headers["etag"]

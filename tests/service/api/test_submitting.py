@@ -119,7 +119,7 @@ def test_pages_batches_and_states(client: TestClient):
 
 
 @pytest.mark.slow
-def test_quotas(tmp_path: Path):
+def test_a_full_quota_refuses_until_a_job_ends(tmp_path: Path):
     with opened(tmp_path, max_jobs_per_owner=1) as client:
         where = post(client, b"slow").headers["location"]
         refused = post(client, b"G1 X1")

@@ -354,7 +354,7 @@ def test_a_backup_without_its_jobs_is_refused(left, data, tmp_path, capsys):
     assert [path.name for path in tmp_path.iterdir()] == ["data"]
 
 
-def test_refusals(store, data, tmp_path, monkeypatch, capsys):
+def test_a_backup_never_replaces_a_file(store, data, tmp_path, monkeypatch, capsys):
     (tmp_path / "there.tar").write_text("mine")
     for target in ("there.tar", "data/b.tar", "data/backups", "no such folder/"):
         assert run(["backup", f"{tmp_path}/{target}", "--data-dir", str(data)]) == 2

@@ -257,7 +257,7 @@ def test_a_cursor_that_no_page_gave(store: JobStore):
             store.page("anna", limit=1, cursor=cursor)
 
 
-def test_counting(store: JobStore):
+def test_jobs_are_counted_by_state(store: JobStore):
     assert store.counts() == dict.fromkeys(JobState, 0)
     assert store.oldest_queued_at() is None
     jobs = [store.add(make_job(created_at=1000.0 + n)) for n in range(4)]

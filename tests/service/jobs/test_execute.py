@@ -13,7 +13,7 @@ import pytest
 
 from stillpath.pipeline.progress import Progress
 from stillpath.service.jobs import patience
-from stillpath.service.jobs.attempt import Workplace
+from stillpath.service.jobs.attempt import WorkerContext
 from stillpath.service.jobs.state import WAITING_FOR_ROOM, Job, JobState, Lost
 from stillpath.service.jobs.watch import STUCK_EXIT_CODE
 from stillpath.service.jobs.worker import execute
@@ -24,7 +24,7 @@ from tests.service.runners import light
 
 @dataclass
 class Bench:
-    """A workplace, and what happened at it."""
+    """A worker, and what happened in it."""
 
     site: Site
     limits: dict[str, Any] = field(default_factory=dict)
@@ -32,7 +32,7 @@ class Bench:
     ends: list[int] = field(default_factory=list)
 
     def run(self, job_id: str, runner: Any = light, storage: Any = None) -> Job:
-        workplace = Workplace(
+        context = WorkerContext(
             self.site.settings.model_copy(update=self.limits),
             self.site.store,
             storage or self.site.storage,
@@ -40,7 +40,7 @@ class Bench:
             interrupted=lambda: self.reason,
             end=self.ends.append,
         )
-        execute(job_id, workplace, runner)
+        execute(job_id, context, runner)
         scratch = self.site.data_dir / "scratch"
         assert not scratch.exists() or not list(scratch.iterdir())
         return self.site.get(job_id)
@@ -50,7 +50,7 @@ def test_a_job_is_claimed_once(site: Site):
     job_id = site.submit("G1 X1")
     first = Bench(site).run(job_id)
     assert Bench(site).run(job_id) == first
-    execute("0" * 32, Workplace(site.settings, site.store, site.storage, site.data_dir), light)
+    execute("0" * 32, WorkerContext(site.settings, site.store, site.storage, site.data_dir), light)
 
 
 @pytest.mark.parametrize(("word", "status"), [("bad", 422), ("crash", 500)])
@@ -104,7 +104,7 @@ def test_an_attempt_that_finishes_too_late_changes_nothing(site: Site):
     def late(task: Any, progress: Any) -> dict[str, Any]:
         summary = light(task, progress)
         site.store.apply(job_id, Lost(1, time.time(), "test", 3))
-        other = Workplace(site.settings, site.store, site.storage, site.data_dir / "other")
+        other = WorkerContext(site.settings, site.store, site.storage, site.data_dir / "other")
         execute(job_id, other, light)
         return summary
 

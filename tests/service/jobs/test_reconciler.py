@@ -12,7 +12,7 @@ import pytest
 
 from stillpath.service.database.engine import DatabaseAway
 from stillpath.service.jobs import reconciler, room
-from stillpath.service.jobs.attempt import Workplace
+from stillpath.service.jobs.attempt import WorkerContext
 from stillpath.service.jobs.reconciler import Reconciler
 from stillpath.service.jobs.state import WAITING_FOR_ROOM, Claimed, Job, JobState, Lost, OutOfRoom
 from stillpath.service.jobs.worker import execute
@@ -222,7 +222,7 @@ def test_a_job_waits_until_the_disk_of_the_storage_has_room(
     monkeypatch.setattr(room, "_NO_ROOM_S", 0.0)
     with small_disk(tmp_path / "disk", 12) as disk:
         site = Site(tmp_path / "data", storage_url=(disk / "store").as_uri())
-        place = Workplace(site.settings, site.store, site.storage, site.data_dir / "scratch")
+        place = WorkerContext(site.settings, site.store, site.storage, site.data_dir / "scratch")
         other = disk / "other"
         other.write_bytes(b"x" * (8 * _MIB))
         job_id = site.submit("long 6")

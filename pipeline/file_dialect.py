@@ -18,10 +18,10 @@ from stillpath.pipeline.options import DialectName
 
 __all__ = [
     "dialect_for",
-    "doubts",
+    "dialect_warnings",
     "extruder_mode_awaited",
-    "passed_over",
-    "perhaps_passed_over",
+    "skipped_notes",
+    "skipped_warnings",
 ]
 
 _SHOWN = 5
@@ -105,7 +105,9 @@ def extruder_mode_awaited(
     return awaiting_extruder_mode(dialect), [warning]
 
 
-def doubts(file: BinaryIO, machine: Machine, name: DialectName | None = None) -> list[str]:
+def dialect_warnings(
+    file: BinaryIO, machine: Machine, name: DialectName | None = None
+) -> list[str]:
     """Return a warning if a file looks as if it were made for another firmware.
 
     Parameters
@@ -149,12 +151,12 @@ def doubts(file: BinaryIO, machine: Machine, name: DialectName | None = None) ->
     return [text]
 
 
-def passed_over(reader: Interpreter) -> list[str]:
+def skipped_warnings(reader: Interpreter) -> list[str]:
     """Return a few warnings about commands that the firmware skips or that are unknown."""
     return _few(reader.warnings)
 
 
-def perhaps_passed_over(reader: Interpreter) -> list[str]:
+def skipped_notes(reader: Interpreter) -> list[str]:
     """Return a few notes on commands that the firmware skips unless the printer has them."""
     return _few([f"line {line}: {text}" for text, line in reader.state.notes.items()])
 

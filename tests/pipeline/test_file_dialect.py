@@ -6,7 +6,7 @@ import io
 
 import pytest
 
-from stillpath.pipeline.reading import doubts
+from stillpath.pipeline.file_dialect import dialect_warnings
 from tests.gcode.cutting import ender3_with
 
 START = b"; a slicer that does not say its flavour\nM83\nM572 S0.04\nG1 X50 Y50 E1 F3000\n"
@@ -25,5 +25,5 @@ def test_pressure_advance_of_the_tool_in_use_is_no_sign_against_reprapfirmware(
     kind: str, text: bytes, doubted: bool
 ) -> None:
     """M572 without D was called a command of Prusa's firmware alone."""
-    found = doubts(io.BytesIO(text), ender3_with(kind))
+    found = dialect_warnings(io.BytesIO(text), ender3_with(kind))
     assert any("written for prusa" in warning for warning in found) is doubted
