@@ -6,7 +6,7 @@ import io
 
 import pytest
 
-from stillpath.pipeline.reading import doubts
+from stillpath.pipeline.reading import dialect_for, doubts, extruder_mode_awaited
 from tests.gcode.cutting import ender3_with
 
 START = b"; a slicer that does not say its flavour\nM83\nM572 S0.04\nG1 X50 Y50 E1 F3000\n"
@@ -27,3 +27,35 @@ def test_pressure_advance_of_the_tool_in_use_is_no_sign_against_reprapfirmware(
     """M572 without D was called a command of Prusa's firmware alone."""
     found = doubts(io.BytesIO(text), ender3_with(kind))
     assert any("written for prusa" in warning for warning in found) is doubted
+
+
+_LINES = "G1 X50 Y50 Z.2 F6000\nG1 X90 E1.5 F1800\nG1 Y90 E1.5\nG1 X50 E1.5\nG1 Y50 E1.5\n"
+_GROWING = "G1 X50 Y50 Z.2 F6000\nG1 X90 E1.5 F1800\nG1 Y90 E3\nG1 X50 E4.5\nG1 E3.5\nG1 E4.5\n"
+
+
+_KISSLICER = "START_PRINT\nG1 X10 Y10 E0 F6000\nG1 E8 F4200\n" + "".join(
+    f"G1 X{10 + k} E{8 + 0.05 * (k - k % 2):.4f} F600\n" for k in range(1, 20)
+)
+"""E stays as it is on the way to the next line."""
+
+
+@pytest.mark.parametrize(
+    ("text", "awaited"),
+    [
+        ("START_PRINT\n" + _LINES, True),
+        (";FLAVOR:Marlin\nprint_start bed=70\nG1 E-6 F4200\n" + _LINES + "G1 E6\n" + _LINES, True),
+        ("START_PRINT\n" + _GROWING, False),
+        (_KISSLICER, False),
+        ("START_PRINT\n" + _GROWING + "G92 E0\n" + _GROWING, False),
+        ("M83\nSTART_PRINT\n" + _LINES, False),
+        ("START_PRINT\nM83\n" + _LINES, False),
+        ("START_PRINT\nG91\n" + _LINES + "G90\n" + _GROWING, False),
+    ],
+)
+def test_a_start_macro_may_have_made_e_relative(text: str, awaited: bool) -> None:
+    """Kiri:Moto says no mode by itself, and Klipper's macro print_start has M83."""
+    machine = ender3_with("klipper")
+    own = dialect_for(machine)
+    dialect, warnings = extruder_mode_awaited(io.BytesIO(text.encode()), machine, own)
+    assert dialect.extruder_mode_known is not awaited
+    assert any("says M82 or M83" in warning for warning in warnings) is awaited
