@@ -303,7 +303,7 @@ class PipelineRun:
         self._sum.original_s += piece.phases.duration_s
         lines = int(piece.moves.line[0]), int(piece.moves.line[-1])
         paces = iter((piece,)) if self._budget is None else self._budget.paced(piece)
-        refusal = self._order.refusal(*lines)
+        refusal = self._order.refusal(*lines) or self._writer.shaper_test(piece)
         if refusal is not None:
             next(paces)  # counts the time with the shaper
             self._put_back(piece, refusal)
