@@ -13,7 +13,6 @@ import numpy as np
 
 from stillpath.gcode.containers.opening import open_text
 from stillpath.gcode.dialect import Dialect
-from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.planning import check_moves_end, check_print_ends, intended
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.interpreter import Interpreter
@@ -26,7 +25,13 @@ from stillpath.pipeline.endless import LengthGuard
 from stillpath.pipeline.measuring.points import MotionSamples
 from stillpath.pipeline.options import DialectName
 from stillpath.pipeline.progress import ProgressCallback, ProgressReports, progress_to
-from stillpath.pipeline.reading import dialect_for, doubts, passed_over, perhaps_passed_over
+from stillpath.pipeline.reading import (
+    dialect_for,
+    doubts,
+    no_moves,
+    passed_over,
+    perhaps_passed_over,
+)
 
 __all__ = ["STANDING_S", "FileMotion", "MotionPart", "TextMotion"]
 
@@ -158,7 +163,7 @@ class TextMotion:
             yield from self._parts(samples, path_mm)
         self.time_s = planner.time_s
         if moves == 0:
-            raise GcodeError("the file contains no moves; is it G-code with LF line ends?")
+            raise no_moves(self._dialect)
 
     def _hold(self, block: ProgramBlock) -> None:
         if len(block.moves):

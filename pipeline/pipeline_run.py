@@ -56,7 +56,7 @@ from stillpath.pipeline.piece_compensator import (
     deviation,
 )
 from stillpath.pipeline.progress import ProgressReports
-from stillpath.pipeline.reading import dialect_for, doubts, extruder_mode_awaited
+from stillpath.pipeline.reading import dialect_for, doubts, extruder_mode_awaited, no_moves
 from stillpath.pipeline.result import PutBack, Result, StageTime
 from stillpath.pipeline.selection import Selection, TooLarge
 from stillpath.pipeline.summary import Summary
@@ -234,7 +234,7 @@ class PipelineRun:
             share = (item.text_offset + len(item.text)) / size
             self._say("compensating", begun + (COMPENSATED - begun) * share)
         if self._sum.moves == 0:
-            raise GcodeError("the file contains no moves; is it G-code with LF line ends?")
+            raise no_moves(self._reader.dialect)
         if self._changes:
             text = self._writer.end(self._sum.newline, self._checker.extruder_mm)
             self._motion.wait(switching_s(self._checker.push(text)))

@@ -10,6 +10,7 @@ from typing import BinaryIO
 from stillpath.gcode.commands import awaiting_extruder_mode
 from stillpath.gcode.detection import EIGHT_BIT_PRUSA, detect
 from stillpath.gcode.dialect import Dialect
+from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.dialects import dialect_of
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.models.errors import ModelError
@@ -21,6 +22,7 @@ __all__ = [
     "dialect_for",
     "doubts",
     "extruder_mode_awaited",
+    "no_moves",
     "passed_over",
     "perhaps_passed_over",
 ]
@@ -197,6 +199,15 @@ def doubts(file: BinaryIO, machine: Machine, name: DialectName | None = None) ->
             f"file compensated for {own.title}, set variant to {found.dialect} in its machine"
         )
     return [text]
+
+
+def no_moves(dialect: Dialect) -> GcodeError:
+    """Return the error for a file in which the firmware finds no move."""
+    title = dialect.title
+    return GcodeError(
+        f"the file contains no moves that {title} reads; is it G-code for {title}, with LF line "
+        "ends? Klipper has no G01, and most builds of Marlin no g1: write G1"
+    )
 
 
 def passed_over(reader: Interpreter) -> list[str]:

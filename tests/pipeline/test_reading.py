@@ -3,11 +3,25 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
+import stillpath
+from stillpath.gcode.errors import GcodeError
+from stillpath.models.machine import Machine
 from stillpath.pipeline.reading import dialect_for, doubts, extruder_mode_awaited
 from tests.gcode.cutting import ender3_with
+
+
+def compensate(source: Path, machine: Machine) -> object:
+    return stillpath.compensate(source, source.with_suffix(".out"), machine)
+
+
+def simulate(source: Path, machine: Machine) -> object:
+    return stillpath.simulate(source, machine)
+
 
 START = b"; a slicer that does not say its flavour\nM83\nM572 S0.04\nG1 X50 Y50 E1 F3000\n"
 
@@ -59,3 +73,15 @@ def test_a_start_macro_may_have_made_e_relative(text: str, awaited: bool) -> Non
     dialect, warnings = extruder_mode_awaited(io.BytesIO(text.encode()), machine, own)
     assert dialect.extruder_mode_known is not awaited
     assert any("says M82 or M83" in warning for warning in warnings) is awaited
+
+
+@pytest.mark.parametrize(("kind", "word"), [("klipper", "G01"), ("marlin", "g1")])
+@pytest.mark.parametrize("work", [compensate, simulate])
+def test_moves_that_the_firmware_does_not_read_are_no_moves(
+    tmp_path: Path, kind: str, word: str, work: Callable[[Path, Machine], object]
+) -> None:
+    """CAM programs write G01; the error asked for LF line ends, which the file had."""
+    source = tmp_path / "part.gcode"
+    source.write_text(f"G28\nM83\n{word} X50 Y50 F6000\n{word} X90 E1\n")
+    with pytest.raises(GcodeError, match=rf"no moves that (Klipper|Marlin) reads.* no {word}\b"):
+        work(source, ender3_with(kind))
