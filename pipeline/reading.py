@@ -43,8 +43,9 @@ _WORD = re.compile(rb"([XYE])[ \t]*([-+]?\d*\.?\d+)", re.IGNORECASE)
 _MOST_PAIRS = 1000
 _MOST_PER_MM = 1.0
 """Filament that no line takes, in mm per mm: an absolute E soon is above that."""
-_FITTING, _NOT_GROWING = 0.9, 0.1
-"""Shares of lines. Wipes let an absolute E fall; of relative ones about half do not grow."""
+_FITTING, _FALLING, _REPEATED = 0.9, 0.1, 0.6
+"""Shares of lines. Wipes let an absolute E fall, KISSlicer repeats it on the way to the next line;
+of relative ones about half fall, or all are the same."""
 _EIGHT_BIT = (
     "the file was sliced for an MK3 or its forerunners (printer_model), whose own board has 8 bits "
     "and cannot execute a compensated file, and {} has a board of 32: unless you replaced the "
@@ -134,7 +135,7 @@ def extruder_mode_awaited(
 def _looks_relative(text: bytes) -> bool:
     """Tell whether E of lines in X and Y is what they take themselves, and often does not grow."""
     x, y, before, in_steps = 0.0, 0.0, 0.0, False
-    pairs, fits, falls = 0, 0, 0
+    pairs, fits, falls, repeats = 0, 0, 0, 0
     for line in _E_LINE.finditer(text):
         # What stands alone (a retraction, and its end) and G92 tell nothing.
         found, before = before, 0.0
@@ -151,10 +152,11 @@ def _looks_relative(text: bytes) -> bool:
             if before > 0.0 and found > 0.0:
                 pairs += 1
                 fits += before < _MOST_PER_MM * way_mm
-                falls += before <= found
+                falls += before < found
+                repeats += before == found
         if pairs == _MOST_PAIRS:
             break
-    return fits > _FITTING * pairs and falls > _NOT_GROWING * pairs
+    return fits > _FITTING * pairs and (falls > _FALLING * pairs or repeats > _REPEATED * pairs)
 
 
 def doubts(file: BinaryIO, machine: Machine, name: DialectName | None = None) -> list[str]:

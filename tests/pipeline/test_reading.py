@@ -50,6 +50,7 @@ _GROWING = "G1 X50 Y50 Z.2 F6000\nG1 X90 E1.5 F1800\nG1 Y90 E3\nG1 X50 E4.5\nG1 
 _KISSLICER = "START_PRINT\nG1 X10 Y10 E0 F6000\nG1 E8 F4200\n" + "".join(
     f"G1 X{10 + k} E{8 + 0.05 * (k - k % 2):.4f} F600\n" for k in range(1, 20)
 )
+_WIDE = "START_PRINT\n" + "".join(f"G1 X{100 * (k % 2)} E{3 + k - k % 2}\n" for k in range(30))
 """E stays as it is on the way to the next line."""
 
 
@@ -60,6 +61,7 @@ _KISSLICER = "START_PRINT\nG1 X10 Y10 E0 F6000\nG1 E8 F4200\n" + "".join(
         (";FLAVOR:Marlin\nprint_start bed=70\nG1 E-6 F4200\n" + _LINES + "G1 E6\n" + _LINES, True),
         ("START_PRINT\n" + _GROWING, False),
         (_KISSLICER, False),
+        (_WIDE, False),
         ("START_PRINT\n" + _GROWING + "G92 E0\n" + _GROWING, False),
         ("M83\nSTART_PRINT\n" + _LINES, False),
         ("START_PRINT\nM83\n" + _LINES, False),
