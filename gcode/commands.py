@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from itertools import takewhile
 
 from stillpath.gcode import _slots as at
+from stillpath.gcode._command_kernels import execute
 from stillpath.gcode.comments import note_object
-from stillpath.gcode.dialect import Handler, Word
+from stillpath.gcode.dialect import Action, Dialect, Handler, Word
 from stillpath.gcode.lexer import Command
-from stillpath.gcode.state import MachineState
+from stillpath.gcode.state import EXTRUDER_MODE, MachineState
 from stillpath.gcode.types import EventKind
 
 __all__ = [
     "NO_ARCS",
     "NO_RETRACTION",
+    "awaiting_extruder_mode",
     "cancel_object",
     "cutter",
     "hold_laser",
@@ -26,6 +29,24 @@ __all__ = [
 
 _OBJECT = re.compile(r"\s*@object(info|stop)?\b([^;]*)", re.IGNORECASE)
 """Marks that the plugin Cancel Objects puts in place of slicers' comments."""
+
+
+def awaiting_extruder_mode(dialect: Dialect) -> Dialect:
+    """Return how a file is read whose E has a mode that the printer was left in.
+
+    RepRapFirmware's files begin with that of config.g, start.g or the print before; the usual
+    config.g has M83 (src/GCodes/GCodes.cpp, CheckFinishedRunningConfigFile, 3.5). Klipper's begin
+    with that of the print before or of a macro (klippy/extras/gcode_move.py, 2026-08).
+    """
+    modes = dict.fromkeys(("M82", "M83"), _extruder_mode)
+    return replace(dialect, words={**dialect.words, **modes}, extruder_mode_known=False)
+
+
+def _extruder_mode(state: MachineState, command: Command) -> int:
+    """M82 and M83 of a file that has fed filament before."""
+    state.hold(EXTRUDER_MODE, False)
+    action = Action.ABSOLUTE_E if command.name == "M82" else Action.RELATIVE_E
+    return int(execute(int(action), state.w, 0, state.f, state.i, state.rows, state.tables))
 
 
 def home(state: MachineState, command: Command) -> int:

@@ -13,7 +13,6 @@ import numpy as np
 
 from stillpath.gcode.containers.opening import open_text
 from stillpath.gcode.dialect import Dialect
-from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.planning import check_moves_end, check_print_ends, intended
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.interpreter import Interpreter
@@ -26,6 +25,7 @@ from stillpath.pipeline.endless import LengthGuard
 from stillpath.pipeline.file_dialect import (
     dialect_for,
     dialect_warnings,
+    no_moves,
     skipped_notes,
     skipped_warnings,
 )
@@ -163,7 +163,7 @@ class TextMotion:
             yield from self._parts(samples, path_mm)
         self.time_s = planner.time_s
         if moves == 0:
-            raise GcodeError("the file contains no moves; is it G-code with LF line ends?")
+            raise no_moves(self._dialect)
 
     def _hold(self, block: ProgramBlock) -> None:
         if len(block.moves):

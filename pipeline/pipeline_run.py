@@ -31,7 +31,12 @@ from stillpath.gcode.types import Events, Moves, Phases, ProgramBlock
 from stillpath.models.errors import ModelError
 from stillpath.pipeline.clock import StageClock
 from stillpath.pipeline.endless import LengthGuard
-from stillpath.pipeline.file_dialect import dialect_for, dialect_warnings, extruder_mode_awaited
+from stillpath.pipeline.file_dialect import (
+    dialect_for,
+    dialect_warnings,
+    extruder_mode_awaited,
+    no_moves,
+)
 from stillpath.pipeline.files import Discarding, default_cache_dir
 from stillpath.pipeline.job_design import design_job
 from stillpath.pipeline.last_check.comparing import LastCheck
@@ -217,7 +222,7 @@ class PipelineRun:
             share = (item.text_offset + len(item.text)) / size
             self._say("compensating", begun + (COMPENSATED - begun) * share)
         if self._sum.moves == 0:
-            raise GcodeError("the file contains no moves; is it G-code with LF line ends?")
+            raise no_moves(self._reader.dialect)
         if self._changes:
             text = self._writer.end(self._sum.newline, self._checker.extruder_mm)
             self._motion.wait(switching_s(self._checker.push(text)))
@@ -287,7 +292,7 @@ class PipelineRun:
         self._sum.original_s += piece.phases.duration_s
         lines = int(piece.moves.line[0]), int(piece.moves.line[-1])
         paces = iter((piece,)) if self._budget is None else self._budget.paced(piece)
-        refusal = self._order.refusal(*lines)
+        refusal = self._order.refusal(*lines) or self._writer.shaper_test(piece)
         if refusal is not None:
             next(paces)  # counts the time with the shaper
             self._put_back(piece, refusal)

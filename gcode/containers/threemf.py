@@ -30,6 +30,7 @@ __all__ = ["ThreeMf"]
 _PLATE = re.compile(r"Metadata/plate_([1-9]\d{0,3})\.gcode")
 _SLICE_INFO = "Metadata/slice_info.config"
 _LARGEST_INFO_BYTES = 1 << 22
+_OF_ULTIMAKER = "/3D/model.gcode"
 _DIGEST = re.compile(rb"\s*([0-9A-Fa-f]{32})")
 _LARGEST_DIGEST_BYTES = 1 << 10
 _COPY_BYTES = 1 << 20
@@ -172,6 +173,11 @@ def _check(archive: zipfile.ZipFile, largest: int) -> None:
     names = [info.filename for info in members]
     if len(set(names)) < len(names):
         raise GcodeError("the 3MF package has members of the same name: export it again")
+    if _OF_ULTIMAKER in names:
+        raise GcodeError(
+            "the file is an UltiMaker Format Package (.ufp), which is not read: let Cura save a "
+            "G-code file (.gcode), or unpack it and give its 3D/model.gcode"
+        )
     for name in names:
         path = PurePosixPath(name.replace("\\", "/"))
         if path.is_absolute() or ".." in path.parts or ":" in name:

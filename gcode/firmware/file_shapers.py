@@ -18,6 +18,7 @@ ADVANCE_LEFT_OFF = (
     "slicer's start code."
 )
 
+_SETTINGS_OF_A_TEST = 4
 _VALUE = re.compile(rb"(?<=[SF=])\s*[-+.\d]+")
 _ADVANCE, _FURTHER_SHAPER = "M572", re.compile(rb"M593(?!\d)", re.IGNORECASE)
 """Pressure advance, which a stream has off like the shaper (RepRapFirmware)."""
@@ -39,6 +40,32 @@ class FileShapers:
         self._names: dict[str, tuple[int, int]] = {}
         """Commands that set a shaper: number of the first line, and how many."""
         self.sets_advance = False
+        self._printed_with: dict[int, list[tuple[bytes, ...]]] = {}
+        """By tool, the settings under which it printed."""
+        self._returned: set[int] = set()
+        """Tools that printed under one again, after another."""
+
+    def test(self, tool: int) -> str | None:
+        """Note that a tool prints under the settings so far; return why this seems to be a test.
+
+        Prints that try shapers out, as OrcaSlicer makes them, go on to another setting at each
+        layer, and never back.
+        """
+        settings = self._printed_with.setdefault(tool, [])
+        now = tuple(self.lines.values())
+        if now and settings[-1:] != [now]:
+            if now in settings:
+                self._returned.add(tool)
+            else:
+                settings.append(now)
+        if len(settings) < _SETTINGS_OF_A_TEST or tool in self._returned:
+            return None
+        said = " and ".join(f"{name} from line {line}" for name, (line, _) in self._names.items())
+        return (
+            f"the file tries one setting of the firmware's shaper after the other ({said}), which "
+            "compensated lines would not show; slice one setting for the whole print if it is no "
+            "test"
+        )
 
     def note(self, line: bytes, number: int) -> None:
         """Record a line that sets the shaper or pressure advance."""

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 from stillpath.gcode.firmware.base import StreamCommands
 from stillpath.gcode.firmware.file_shapers import ADVANCE_LEFT_OFF, FileShapers
+from stillpath.gcode.pieces import Piece
 from stillpath.gcode.types import Limits
 
 __all__ = ["ShaperSwitch"]
@@ -51,6 +52,10 @@ class ShaperSwitch:
         """Note that a line of the file, of this number, sets the shaper or pressure advance."""
         self.is_off = False
         self._by_file.note(line, number)
+
+    def test(self, piece: Piece) -> str | None:
+        """Return why a piece seems to belong to a test of the firmware's shaper, or None."""
+        return self._by_file.test(int(piece.moves.tool[0]))
 
     def off_lines(self) -> bytes:
         """Return the lines that a stream needs before it, without counting them as written."""

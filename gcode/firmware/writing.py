@@ -144,6 +144,10 @@ class StreamWriter:
         self._behind_mark = ends_at_mark(verbatim) or (self._behind_mark and not len(moves))
         return lead + file_text(verbatim, self._stream_commands, file_mm, **where)
 
+    def shaper_test(self, piece: Piece) -> str | None:
+        """Return why a piece seems to belong to a test of the firmware's shaper, or None."""
+        return self._shaper.test(piece)
+
     def piece(self, piece: Piece, encoded: Encoded, extruder_mm: float) -> bytes:
         """Return the text of a compensated piece; `extruder_mm` as in `verbatim`."""
         self._extruder.reads(extruder_mm)

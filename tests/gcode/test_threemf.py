@@ -77,6 +77,8 @@ def test_packages_that_are_refused(tmp_path: Path):
     refused(package({}), tmp_path, "no sliced plate")
     wrapped = package({}, more={"part.gcode": TEXT})
     refused(wrapped, tmp_path, "ZIP archive with 'part.gcode' in it.*unpack")
+    ultimakers = package({}, more={"/3D/model.gcode": TEXT, "/Metadata/thumbnail.png": b"x"})
+    refused(ultimakers, tmp_path, r"UltiMaker Format Package.*let Cura save a G-code file")
     for name in ("../evil.gcode", "/etc/x", "a/../../x", "C:\\x", "..\\x"):
         refused(package({1: TEXT}, more={name: b"x"}), tmp_path, "leads out of it")
     with warnings.catch_warnings():

@@ -154,3 +154,28 @@ def test_fixed_time_motion_that_is_off_or_that_the_machine_has(tmp_path: Path, c
         by_zpetc(f"{line}\n{HEAD}{PART}{BEHIND}", machine_with("marlin"), tmp_path, cache)
     with pytest.raises(ModelError, match="fixed-time motion"):
         by_zpetc(HEAD + PART, machine_with("marlin", ft_motion=True), tmp_path, cache)
+
+
+@pytest.mark.parametrize("kind", sorted(SETS))
+@pytest.mark.parametrize(
+    ("settings", "kept"),
+    [
+        ("1 20;1 25;1 30;1 35;1 40", 2),
+        ("1 20;2 25;3 30;4 35;5 40;1 20", 0),  # tools with shapers of their own
+        ("1 20;1 25;1 20;1 30;1 35;1 40", 0),  # one that comes back
+    ],
+)
+def test_a_test_of_the_firmwares_shaper_shows_the_shaper(
+    tmp_path: Path, cache: Path, kind: str, settings: str, kept: int
+) -> None:
+    """OrcaSlicer's towers change its frequency at every layer; a stream has it off."""
+    text, last = HEAD, ""
+    for tool, hz in (setting.split() for setting in settings.split(";")):
+        changed = f"T{tool}\n" if tool != last else ""
+        text += changed + re.sub(r"(?<=[XYF])(=?)4[250]", rf"\g<1>{hz}", SETS[kind]) + "\n"
+        text, last = text + "G28 X\nG1 X50 Y50 F6000\n" + PART + "G1 E-1 F2100\nG1 E1\n", tool
+    result, lines = by_zpetc(text, machine_with(kind), tmp_path, cache)
+    sliced = [piece for piece in result.put_back if "one setting of" in piece.reason]
+    assert len(sliced) == len(result.put_back)
+    assert len(sliced) == kept
+    assert any("; stillpath: stream on" in line for line in lines)

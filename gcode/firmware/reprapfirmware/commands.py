@@ -11,13 +11,11 @@ from dataclasses import replace
 import numpy as np
 
 from stillpath.gcode import _slots as at
-from stillpath.gcode._command_kernels import execute
 from stillpath.gcode._motion_kernels import set_feed
 from stillpath.gcode.commands import retract
 from stillpath.gcode.commands import tool as other_tool
-from stillpath.gcode.dialect import Action
 from stillpath.gcode.lexer import Command
-from stillpath.gcode.state import EXTRUDER_MODE, MachineState, Saved
+from stillpath.gcode.state import MachineState, Saved
 from stillpath.gcode.types import EventKind
 from stillpath.gcode.workspaces import set_workspace
 
@@ -26,7 +24,6 @@ __all__ = [
     "accelerations",
     "define_tool",
     "extrude_factor",
-    "extruder_mode",
     "heat_and_wait",
     "jerk",
     "jerk_below_ceiling",
@@ -135,13 +132,6 @@ def tool(state: MachineState, command: Command) -> int:
     state.f[at.F_LIMITS + column] = state.factors.get(key, row[column])
     state.note_limits()
     return found
-
-
-def extruder_mode(state: MachineState, command: Command) -> int:
-    """M82 and M83 of a file that has fed filament before."""
-    state.hold(EXTRUDER_MODE, False)
-    action = Action.ABSOLUTE_E if command.name == "M82" else Action.RELATIVE_E
-    return int(execute(int(action), state.w, 0, state.f, state.i, state.rows, state.tables))
 
 
 def extrude_factor(state: MachineState, command: Command) -> int:

@@ -5,8 +5,6 @@ Sources: docs/dialects.md, which also says what was not read in the firmware's o
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from stillpath.gcode.commands import NO_ARCS, cancel_object, cutter, home, host_command, retract
 from stillpath.gcode.dialect import (
     Action,
@@ -29,7 +27,7 @@ from stillpath.gcode.types import EventKind
 from stillpath.gcode.workspaces import machine_space, save_place, select_workspace
 from stillpath.models.firmware import RepRapFirmware
 
-__all__ = ["awaiting_extruder_mode", "reprapfirmware"]
+__all__ = ["reprapfirmware"]
 
 LONGEST_COMMAND = 255
 
@@ -124,16 +122,6 @@ STEPS: dict[str, Word] = {
     "M92": not_modelled(EventKind.STOP, "steps per mm are taken from the machine"),
     "M593": EventKind.SHAPER,
 }
-
-
-def awaiting_extruder_mode(dialect: Dialect) -> Dialect:
-    """Return how a file is read that does not begin with M82 or M83.
-
-    Files begin with the mode that config.g, start.g or the print before has left; the usual
-    config.g has M83 (RepRapFirmware src/GCodes/GCodes.cpp, CheckFinishedRunningConfigFile, 3.5).
-    """
-    modes = dict.fromkeys(("M82", "M83"), commands.extruder_mode)
-    return replace(dialect, words={**dialect.words, **modes}, extruder_mode_known=False)
 
 
 def reprapfirmware(firmware: RepRapFirmware) -> Dialect:
