@@ -30,6 +30,7 @@ from stillpath.service.jobs.problems import (
     storage_away,
     storage_never_fits,
 )
+from stillpath.service.jobs.room import has_room_again
 from stillpath.service.jobs.state import Event, Failed, Finished, Job, Lost, OutOfRoom
 from stillpath.service.jobs.store import JobStore
 from stillpath.service.jobs.task import Runner, Task
@@ -99,6 +100,9 @@ class Attempt:
 
         A full disk is not a failure: the job waits for room.
         """
+        if self._job.room_bytes and not has_room_again(self._job, self._disk, self._storage):
+            # Where workers have disks of their own only they know; to compute would be in vain.
+            return OutOfRoom(self._job.attempt, time.time())
         try:
             with _new_folder(self._folder):
                 try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import shutil
 import time
 from dataclasses import dataclass, field
@@ -14,12 +15,16 @@ import pytest
 from stillpath.pipeline.progress import Progress
 from stillpath.service.jobs import patience
 from stillpath.service.jobs.attempt import Workplace
+from stillpath.service.jobs.room import RoomForJobs
 from stillpath.service.jobs.state import WAITING_FOR_ROOM, Job, JobState, Lost
 from stillpath.service.jobs.watch import STUCK_EXIT_CODE
 from stillpath.service.jobs.worker import execute
 from stillpath.service.storage import StorageError
+from stillpath.service.storage.disk import Disk
 from tests.service.jobs.site import Site, until
 from tests.service.runners import light
+
+_RESULT_BYTES = 3 << 20
 
 
 @dataclass
@@ -215,6 +220,40 @@ def test_a_job_without_room_waits_in_the_queue(site: Site):
     job = Bench(site).run(site.submit("G1"), storage=broken)
     assert (job.state, job.stage, job.losses) == (JobState.QUEUED, WAITING_FOR_ROOM, 0)
     assert Bench(site).run(job.id).state is JobState.DONE
+    site.check_files()
+
+
+def test_what_a_quota_has_no_room_for_is_not_computed_again_in_vain(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+):
+    """The disk has room: of a quota only asking for it tells."""
+    quota_bytes = computed = 0
+
+    def reserves(_: int, __: int, more_bytes: int) -> None:
+        if more_bytes > quota_bytes:
+            raise OSError(errno.EDQUOT, "Disk quota exceeded")
+
+    def writes(task: Any, progress: Any) -> dict[str, Any]:
+        nonlocal computed
+        computed += 1
+        task.target.write_bytes(bytes(_RESULT_BYTES))
+        if quota_bytes < _RESULT_BYTES:
+            raise OSError(errno.EDQUOT, "Disk quota exceeded")
+        return light(task, progress)
+
+    monkeypatch.setattr("stillpath.service.storage.disk.os.posix_fallocate", reserves)
+    monkeypatch.setattr("stillpath.service.jobs.room._NO_ROOM_S", 0.0)
+    look = RoomForJobs(Disk(site.data_dir, 0), site.storage, is_own_disk=True)
+    job_id = site.submit("G1")
+    for _ in range(3):
+        job = Bench(site).run(job_id, writes)  # as where workers have disks of their own
+        assert (job.state, job.stage) == (JobState.QUEUED, WAITING_FOR_ROOM)
+        assert not any(look.for_retry(job, time.monotonic()) for _ in range(3))
+    assert computed == 1
+    assert (job.room_bytes or 0) >= _RESULT_BYTES
+    quota_bytes = 64 * _RESULT_BYTES
+    assert look.for_retry(job, time.monotonic())
+    assert Bench(site).run(job_id, writes).state is JobState.DONE
     site.check_files()
 
 
