@@ -190,14 +190,21 @@ class Reconciler:
         """After a long time without a service, start no print that nobody expects any more.
 
         A clock that is put right while we run (a board without a battery, once it has a network)
-        says so of the time before we began: what was submitted since is expected.
+        says so of the time before we began: what was submitted since is expected. Where a clock
+        was set back before we began (such a board, after a power cut), nobody knows how long that
+        was.
         """
-        latest = time.time() - START_WITHIN_S
-        if self._store.leased_until(_LEASE) < latest:
-            ran = self._has_lease and _since_boot_s() - self._awake_at < START_WITHIN_S
+        now = time.time()
+        latest = now - START_WITHIN_S
+        until = self._store.leased_until(_LEASE)
+        ran = self._has_lease and _since_boot_s() - self._awake_at < START_WITHIN_S
+        jobs = 0
+        if until < latest:
             jobs = self._store.hold_back_starts(min(latest, self._began_at) if ran else latest)
-            if jobs:
-                self._log.warning("prints will not be started: no service was running", jobs=jobs)
+        elif not ran and until > now + START_WITHIN_S:
+            jobs = self._store.hold_back_starts(self._began_at, now)
+        if jobs:
+            self._log.warning("prints will not be started: no service was running", jobs=jobs)
 
     def _take_over(self) -> None:
         """Requeue what ran when the previous service ended, together with its workers.

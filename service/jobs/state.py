@@ -125,6 +125,8 @@ class Job:
         Address that is notified when the job ends.
     printer, print_after : str or None, bool
         Printer that the result is uploaded to, and whether it then starts to print.
+    held_back : bool
+        Whether it does not start after all: for too long no service ran that could do the job.
     """
 
     id: str
@@ -161,6 +163,7 @@ class Job:
     webhook: str | None = None
     printer: str | None = None
     print_after: bool = False
+    held_back: bool = False
 
     @property
     def sources(self) -> list[str]:

@@ -341,10 +341,14 @@ class JobStore:
         heard = func.coalesce(_JOBS.heartbeat_at, _JOBS.started_at, 0.0)
         return self._jobs(select(tables.jobs).where(_JOBS.state == "running", heard < before))
 
-    def hold_back_starts(self, before: float) -> int:
-        """Let unfinished jobs that were submitted before a time start no printer; count them."""
-        waits = (_JOBS.state.not_in(OVER), _JOBS.print_after, _JOBS.created_at < before)
-        return self._count(update(tables.jobs).where(*waits).values(print_after=False))
+    def hold_back_starts(self, before: float, after: float = math.inf) -> int:
+        """Let unfinished jobs start no printer that were submitted before a time; count them.
+
+        Likewise those submitted after the time `after`, by a clock that was set back since.
+        """
+        old = or_(_JOBS.created_at < before, _JOBS.created_at > after)
+        waits = (_JOBS.state.not_in(OVER), _JOBS.print_after, ~_JOBS.held_back, old)
+        return self._count(update(tables.jobs).where(*waits).values(held_back=True))
 
     # Deleting
 

@@ -137,7 +137,8 @@ def test_a_print_is_not_started_days_after_it_was_expected(
     created_at = now - submitted_h * 3600
     job_id = site.submit("G1", printer="left", print_after=True, created_at=created_at)
     look._tick()
-    assert site.get(job_id).print_after == (min(away_h, submitted_h) < 1.0)
+    job = site.get(job_id)
+    assert (job.print_after, job.held_back) == (True, min(away_h, submitted_h) > 1.0)
 
 
 @pytest.mark.parametrize("slept", [False, True])
@@ -170,8 +171,36 @@ def test_a_clock_that_is_put_right_keeps_no_print_from_starting(
     clock.ahead_s = 8 * 3600.0
     look._leased_at -= 3.0
     look._tick()
-    assert not site.get(yesterdays).print_after
-    assert site.get(todays).print_after != slept
+    assert site.get(yesterdays).held_back
+    assert site.get(todays).held_back == slept
+
+
+def test_a_print_from_before_the_clock_was_set_back_is_not_started(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+):
+    """A board without a battery begins in 1970; for how long it was off nobody knows."""
+
+    @dataclass
+    class Clock:
+        CLOCK_BOOTTIME: int = 7
+
+        def time(self) -> float:
+            return 100.0
+
+        def monotonic(self) -> float:
+            return time.monotonic()
+
+        def clock_gettime(self, _: int) -> float:
+            return time.monotonic()
+
+    site.store.lease("reconciler", "before the power cut", 5.0, time.time())
+    before = site.submit("G1", printer="left", print_after=True)
+    monkeypatch.setattr(reconciler, "time", Clock())
+    look = looking(site, Workers())
+    since = site.submit("G1 X", printer="left", print_after=True, created_at=100.0)
+    look._tick()
+    assert site.get(before).held_back
+    assert not site.get(since).held_back
 
 
 def test_a_database_that_takes_no_writes_is_trouble_that_lasts(
