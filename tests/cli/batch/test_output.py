@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import errno
 import os
+import stat
 from pathlib import Path
 
 import pytest
 
 from stillpath.cli.batch.output import Figures, Outcome, OutputFolder, sha256_of
+from stillpath.service.storage.local import LocalStorage
 
 TEXT = "; compensated\nG28\n"
 
@@ -70,6 +72,25 @@ def test_what_file_managers_leave_is_no_obstacle(tmp_path):
     (tmp_path / ".stillpath" / "work" / ".DS_Store").write_bytes(b"x")
     with OutputFolder.opened(tmp_path) as output:
         done(output, "; the next one\n")
+
+
+def test_a_file_system_that_syncs_no_folders(tmp_path, monkeypatch):
+    """As fsync(2) of VirtualBox's shared folders answers; of files it may not fail."""
+    fsync = os.fsync
+
+    def of_files(handle):
+        if stat.S_ISDIR(os.fstat(handle).st_mode):
+            raise OSError(errno.EINVAL, "Invalid argument")
+        fsync(handle)
+
+    monkeypatch.setattr(os, "fsync", of_files)
+    with OutputFolder.opened(tmp_path) as output:
+        assert output.is_there(done(output))
+    storage = LocalStorage(tmp_path / "storage")
+    upload = tmp_path / "upload"
+    upload.write_text(TEXT)
+    storage.put("jobs/a/source/a.gcode", upload)
+    assert storage.stat("jobs/a/source/a.gcode").size_bytes == len(TEXT)
 
 
 @pytest.fixture(name="other_disk")
