@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from stillpath.pipeline.progress import Progress
-from stillpath.service.jobs import patience
+from stillpath.service.jobs import attempt, patience
 from stillpath.service.jobs.attempt import Workplace
 from stillpath.service.jobs.room import RoomForJobs
 from stillpath.service.jobs.state import WAITING_FOR_ROOM, Job, JobState, Lost
@@ -206,6 +206,7 @@ def test_a_storage_that_stays_away_is_the_reason_in_the_end(
 
 def test_a_job_waits_for_a_disk_that_is_away(site: Site, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(patience, "_PATIENCE_S", 0.0)
+    monkeypatch.setattr(attempt, "_AGAIN_S", 0.0)
     job_id = site.submit("G1")
     (site.data_dir / ".fresh").rename(site.data_dir / ".away")
     for _ in range(3):
@@ -213,6 +214,24 @@ def test_a_job_waits_for_a_disk_that_is_away(site: Site, monkeypatch: pytest.Mon
         assert (job.state, job.losses) == (JobState.QUEUED, 0)
     (site.data_dir / ".away").rename(site.data_dir / ".fresh")
     assert Bench(site).run(job_id).state is JobState.DONE
+
+
+@pytest.mark.parametrize("again", [False, True])
+def test_a_disk_that_fails_once_fails_no_job(site: Site, again: bool):
+    """As a memory card does, or a disk that is pulled."""
+
+    def breaks(task: Any, progress: Any) -> dict[str, Any]:
+        if task.attempt == 1 or again:
+            raise OSError(errno.EROFS, "Read-only file system", str(task.target))
+        return light(task, progress)
+
+    job = Bench(site).run(site.submit("G1"), breaks)
+    assert (job.state, job.losses) == (JobState.QUEUED, 1)
+    job = Bench(site).run(job.id, breaks)
+    assert job.state is (JobState.FAILED if again else JobState.DONE)
+    if again:
+        assert (job.problem["status"], job.problem["title"]) == (503, "Storage unavailable")
+        assert "Read-only file system" in job.problem["detail"]
 
 
 def test_a_job_without_room_waits_in_the_queue(site: Site):
