@@ -287,8 +287,9 @@ class Sender:
             return "uploaded, but not started, because it may be unsafe"
         if job.held_back:
             return (
-                "uploaded, but not started: it waited while no service ran for an hour or more, "
-                "and nobody may be there; start it at the printer"
+                "uploaded, but not started: for an hour or more the job could not be done (no "
+                "service, no worker, or no room on the disk), and nobody may be there; start it at "
+                "the printer"
             )
         # The age is unknown where a clock was set back.
         if abs(time.time() - (job.finished_at or 0.0)) > self._times.start_within_s:

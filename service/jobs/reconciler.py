@@ -71,6 +71,7 @@ class Reconciler:
         self._broken_since: dict[str, float] = {}
         self._has_lease = False
         self._leased_at = self._awake_at = 0.0
+        self._able_at = _since_boot_s()
         # By the clock: when we began to be the service that runs.
         self._began_at = time.time()
         # Free slots after the last check; None during one.
@@ -184,7 +185,7 @@ class Reconciler:
             self._has_lease = self._store.lease(_LEASE, self._holder, _LEASE_S, time.time())
             self._leased_at, self._awake_at = now, _since_boot_s()
             if not had_lease:
-                self._began_at = time.time()
+                self._began_at, self._able_at = time.time(), self._awake_at
 
     def _hold_back_starts(self) -> None:
         """After a long time without a service, start no print that nobody expects any more.
@@ -205,6 +206,15 @@ class Reconciler:
             jobs = self._store.hold_back_starts(self._began_at, now)
         if jobs:
             self._log.warning("prints will not be started: no service was running", jobs=jobs)
+
+    def _note_able(self) -> None:
+        """Note that jobs can be done; after a long time without workers or room, start no print."""
+        now_s = _since_boot_s()
+        if now_s - self._able_at > START_WITHIN_S:
+            jobs = self._store.hold_back_starts(time.time() - START_WITHIN_S)
+            if jobs:
+                self._log.warning("prints will not be started: no job could be done", jobs=jobs)
+        self._able_at = now_s
 
     def _take_over(self) -> None:
         """Requeue what ran when the previous service ended, together with its workers.
@@ -268,10 +278,13 @@ class Reconciler:
 
         Not more: a job already waiting at Dask could not be overtaken by a more urgent one.
         """
+        has_room = self._room.for_any()
+        if self.slots and has_room:
+            self._note_able()
         busy = {job.id: job for job in self._store.in_state(JobState.RUNNING)}
         busy |= {job_id: job for job_id, (job, _) in self._in_flight.items()}
         free = self.slots - len(busy)
-        if free > 0 and self._room.for_any():
+        if free > 0 and has_room:
             # Short jobs may use any slot; some slots are reserved for them.
             long = sum(not job.kind.is_short for job in busy.values())
             kept = min(self._settings.computing_processes, self.slots - 1)

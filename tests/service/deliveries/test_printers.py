@@ -233,7 +233,7 @@ def test_a_print_that_was_held_back_is_told(tmp_path: Path):
         with place.sending():
             delivery = place.settled(job)
     assert delivery.state == "done"
-    assert "not started: it waited while no service ran" in (delivery.error or "")
+    assert "not started: for an hour or more the job could not be done" in (delivery.error or "")
     assert uploads(server)[0].parts()["print"][1] == b"false"
 
 

@@ -203,6 +203,48 @@ def test_a_print_from_before_the_clock_was_set_back_is_not_started(
     assert not site.get(since).held_back
 
 
+@pytest.mark.parametrize("lacking", ["workers", "room"])
+@pytest.mark.parametrize("hours", [0.5, 72.0])
+def test_a_print_for_which_nothing_could_be_done_for_days_is_not_started(
+    site: Site, monkeypatch: pytest.MonkeyPatch, lacking: str, hours: float
+):
+    """The service ran, but its workers were away, or the disk was full."""
+    workers = Workers()
+    look = looking(site, workers)
+    look._tick()
+    days = 0.0
+    monkeypatch.setattr(reconciler, "_since_boot_s", lambda: since + days)
+    since = look._able_at
+    with monkeypatch.context() as trouble:
+        if lacking == "workers":
+            trouble.setattr(workers, "slots", lambda: 0)
+        else:
+            trouble.setattr(look._room, "for_any", lambda: False)
+        look._tick()
+        created_at = time.time() - 3600.0 * hours
+        old = site.submit("G1", printer="left", print_after=True, created_at=created_at)
+        new = site.submit("G1 X", printer="left", print_after=True)
+        days = 3600.0 * hours
+        look._tick()
+    look._tick()
+    assert site.get(old).held_back == (hours > 1.0)
+    assert not site.get(new).held_back
+
+
+def test_who_takes_over_the_work_starts_prints(site: Site, monkeypatch: pytest.MonkeyPatch):
+    """It was ready for days, while another service did the jobs."""
+    site.store.lease("reconciler", "another", 5.0, time.time())
+    look = looking(site, Workers())
+    look._tick()
+    since = look._able_at
+    monkeypatch.setattr(reconciler, "_since_boot_s", lambda: since + 72 * 3600.0)
+    site.store.release("reconciler", "another", time.time())
+    created_at = time.time() - 5000.0
+    job_id = site.submit("G1", printer="left", print_after=True, created_at=created_at)
+    look._tick()
+    assert not site.get(job_id).held_back
+
+
 def test_a_database_that_takes_no_writes_is_trouble_that_lasts(
     site: Site, monkeypatch: pytest.MonkeyPatch
 ):
