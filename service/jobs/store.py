@@ -9,6 +9,7 @@ from __future__ import annotations
 import base64
 import json
 import math
+import uuid
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -48,6 +49,8 @@ from stillpath.service.jobs.submissions import Quota, same_job, submission, subm
 __all__ = ["BadCursor", "JobStore", "Page"]
 
 _JOBS = tables.jobs.c
+_IDENTITY = "database"
+"""Lease that nobody gives up: its holder is the database's name."""
 _CLOCKS_APART = 12
 """A lease that exceeds its duration by this factor dates from before the clock was set."""
 
@@ -397,6 +400,19 @@ class JobStore:
         with reading(self.engine) as connection:
             query = select(leases.expires_at).where(leases.name == name)
             return float(connection.execute(query).scalar() or 0.0)
+
+    def identity(self) -> str:
+        """Return the name of this database, which is random and stays."""
+        row = {"name": _IDENTITY, "holder": uuid.uuid4().hex, "expires_at": 0.0}
+        query = select(tables.leases.c.holder).where(tables.leases.c.name == _IDENTITY)
+        with reading(self.engine) as connection:
+            known = connection.execute(query).scalar()
+        if known is None:
+            with writing(self.engine) as connection:
+                named = insert(connection, tables.leases).values(row).on_conflict_do_nothing()
+                connection.execute(named)
+                known = connection.execute(query).scalar_one()
+        return str(known)
 
     # Private
 
