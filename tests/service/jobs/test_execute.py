@@ -13,10 +13,11 @@ from typing import Any
 import pytest
 
 from stillpath.pipeline.progress import Progress
+from stillpath.service.database.engine import DatabaseAway
 from stillpath.service.jobs import attempt, patience
 from stillpath.service.jobs.attempt import Workplace
 from stillpath.service.jobs.room import RoomForJobs
-from stillpath.service.jobs.state import WAITING_FOR_ROOM, Job, JobState, Lost
+from stillpath.service.jobs.state import WAITING_FOR_ROOM, Finished, Job, JobState, Lost
 from stillpath.service.jobs.watch import STUCK_EXIT_CODE
 from stillpath.service.jobs.worker import execute
 from stillpath.service.storage import StorageError
@@ -202,6 +203,27 @@ def test_a_storage_that_stays_away_is_the_reason_in_the_end(
     assert (job.problem["status"], job.problem["title"]) == (503, "Storage unavailable")
     assert "away" in job.problem["detail"]
     assert "memory" not in job.problem["detail"]
+
+
+@pytest.mark.parametrize("stopped", [False, True])
+def test_what_took_hours_waits_for_a_database_that_is_away(
+    site: Site, monkeypatch: pytest.MonkeyPatch, stopped: bool
+):
+    """As while PostgreSQL is moved to another computer."""
+    monkeypatch.setattr(patience, "_PATIENCE_S", 0.0)
+    bench, apply, away = Bench(site), site.store.apply, 3
+
+    def later(job_id: str, event: Any) -> Any:
+        nonlocal away
+        if isinstance(event, Finished) and away:
+            away -= 1
+            bench.reason = "the worker was stopped" if stopped else None
+            raise DatabaseAway("no connection")
+        return apply(job_id, event)
+
+    monkeypatch.setattr(site.store, "apply", later)
+    job = bench.run(site.submit("G1"))
+    assert (job.state, away) == ((JobState.RUNNING, 2) if stopped else (JobState.DONE, 0))
 
 
 def test_a_job_waits_for_a_disk_that_is_away(site: Site, monkeypatch: pytest.MonkeyPatch):
