@@ -23,8 +23,9 @@ from stillpath.service.instance_lock import exclusive
 __all__ = ["Figures", "Outcome", "OutputFolder", "Scratch", "State", "Trouble", "sha256_of"]
 
 State = Literal["done", "done before", "failed"]
-Trouble = Literal["", "file", "machine", "computer"]
-"""Whose fault a failure is: the file's, the machine's (or options'), or the computer's."""
+Trouble = Literal["", "file", "machine", "computer", "work"]
+"""Whose fault a failure is: the file's, the machine's (or options'), or the computer's; or the work
+itself broke (a process that died, memory, time, an error of the program) and may do so again."""
 
 _RECORD = "record.json"
 _CHUNK_BYTES = 1 << 20
