@@ -36,6 +36,10 @@ _TICK_S = 0.5
 _SWEEP_EVERY_S = 60.0
 _GIVE_BACK_S = 1.5
 """Time for a closing worker to give its job back; it checks twice a second."""
+_FORGIVEN_ENDS = 2
+"""How often a job may have been under way when its service was killed or lost power before it is
+suspected: a job that takes all memory of a small computer would freeze it after each start."""
+_ENDED = "the service or the computer went down while the job was under way"
 _RETRY_S, _LONGEST_RETRY_S = 0.5, 5.0
 _OWN_GRACE_S, _GRACE_S = 60.0, 5.0
 """Time for which our own workers, which restart by themselves, and remote ones may be away before
@@ -224,7 +228,8 @@ class Reconciler:
         """
         if self._store.engine.dialect.name == "sqlite":
             for job in self._store.in_state(JobState.RUNNING):
-                self._give_back(job.id, job.attempt, "the service ended", blame=False)
+                suspect = job.attempt > _FORGIVEN_ENDS
+                self._give_back(job.id, job.attempt, _ENDED, blame=suspect)
         self._took_over = True
 
     def _find_silent(self) -> None:
@@ -235,7 +240,8 @@ class Reconciler:
             reason = f"nothing was heard of its worker {job.worker} for {timeout_s:g} s"
             # Our own workers end with their service: an earlier one began what we did not.
             ended = self._cluster.is_own and job.id not in self._in_flight
-            self._give_back(job.id, job.attempt, reason, blame=not ended)
+            blame = not ended or job.attempt > _FORGIVEN_ENDS
+            self._give_back(job.id, job.attempt, _ENDED if ended else reason, blame=blame)
 
     def _collect(self) -> None:
         """Drop finished futures; a job that is still running then has lost its worker.

@@ -102,6 +102,27 @@ def test_a_service_that_was_killed_is_no_loss_of_its_jobs(site: Site, own: bool,
     assert (job.state, job.losses) == (JobState.QUEUED, int(ours or not own))
 
 
+@pytest.mark.parametrize("own_database", [True, False])
+def test_a_job_that_freezes_the_computer_is_not_begun_for_ever(site: Site, own_database: bool):
+    """Somebody switches it off and on again; the job would freeze it as soon as it is on."""
+    job_id = site.submit("G1")
+    ends = 0
+    while site.get(job_id).state is JobState.QUEUED:
+        began = time.time() if own_database else time.time() - 3600.0
+        site.store.apply(job_id, Claimed(began, "w"))
+        ends += 1
+        look = looking(site, Workers())
+        look._took_over = not own_database  # PostgreSQL tells of it by silence
+        look._steady._since_s -= 3600.0
+        look._tick()
+        site.store.release("reconciler", look._holder, time.time())
+        assert ends < 9
+    job = site.get(job_id)
+    assert (job.state, ends) == (JobState.FAILED, 4)
+    assert job.problem is not None
+    assert "the computer went down while the job was under way" in job.problem["detail"]
+
+
 def test_a_disk_that_held_everybody_up_is_no_silence(site: Site, monkeypatch: pytest.MonkeyPatch):
     """A worker's heartbeat waits for the disk as the reconciler does, and may come after it."""
     look = looking(site, Workers())
