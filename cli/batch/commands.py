@@ -98,7 +98,7 @@ def batch(
     typer.echo(f"summary: {output / 'summary.html'}, .json, .csv")
     troubles = {outcome.trouble for outcome in outcomes if outcome.state == "failed"}
     if troubles:
-        raise typer.Exit(1 if "computer" in troubles else 2)
+        raise typer.Exit(1 if troubles & {"computer", "work"} else 2)
 
 
 def watch(

@@ -94,7 +94,7 @@ class LocalWorker:
                 raise Stopped from None
             raise Failure(
                 f"{reason}; most often it ran out of memory: take fewer --jobs, or try again",
-                "computer",
+                "work",
             ) from None
         if isinstance(answer, Failure):
             raise answer
@@ -149,14 +149,14 @@ def failure_of(error: Exception) -> Failure:
         case ModelError() | DesignError():
             return Failure(str(error), "machine")
         case MemoryError():
-            return Failure("out of memory; take fewer --jobs", "computer")
+            return Failure("out of memory; take fewer --jobs", "work")
         case OSError():
             place = f"{error.filename}: " if error.filename else ""
             if error.errno == errno.ENAMETOOLONG:
                 return Failure(f"{place}{error.strerror}; rename the file", "file")
             return Failure(f"{place}{error.strerror or error}", "computer")
         case _:
-            return Failure(f"an error of the program: {type(error).__name__}: {error}", "computer")
+            return Failure(f"an error of the program: {type(error).__name__}: {error}", "work")
 
 
 def compensate(task: FileTask) -> FileResult:

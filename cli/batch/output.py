@@ -11,7 +11,7 @@ import errno
 import hashlib
 import shutil
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Literal
 
@@ -23,8 +23,9 @@ from stillpath.service.instance_lock import exclusive
 __all__ = ["Figures", "Outcome", "OutputFolder", "Scratch", "State", "Trouble", "sha256_of"]
 
 State = Literal["done", "done before", "failed"]
-Trouble = Literal["", "file", "machine", "computer"]
-"""Whose fault a failure is: the file's, the machine's (or options'), or the computer's."""
+Trouble = Literal["", "file", "machine", "computer", "work"]
+"""Whose fault a failure is: the file's, the machine's (or options'), or the computer's; or the work
+itself broke (a process that died, memory, time, an error of the program) and may do so again."""
 
 _RECORD = "record.json"
 _CHUNK_BYTES = 1 << 20
@@ -161,22 +162,39 @@ class OutputFolder:
         for folder in self._work.iterdir():
             outcome = _read(folder / _RECORD)
             if outcome is not None:
-                self._place(folder, outcome)
+                # Where a printer's share is away, the others' files go on; this one is done again.
+                with suppress(OSError):
+                    self._place(folder, outcome)
             elif folder.is_dir():  # or what a file manager leaves everywhere
                 shutil.rmtree(folder)
 
     def _place(self, folder: Path, outcome: Outcome) -> None:
-        """Move everything to its place; may be done again after it was broken off anywhere."""
+        """Move everything to its place; may be done again after it was broken off anywhere.
+
+        What lies on another disk, such as a printer's share where a machine's results belong, is
+        copied; the originals go last, with their folder.
+        """
         scratch = Scratch(folder, outcome.output)
         if scratch.report.is_dir():
             report = self.root / outcome.report
             report.parent.mkdir(parents=True, exist_ok=True)
             shutil.rmtree(report, ignore_errors=True)
-            scratch.report.replace(report)
+            try:
+                scratch.report.replace(report)
+            except OSError as error:
+                if error.errno != errno.EXDEV:
+                    raise
+                shutil.copytree(scratch.report, report)
         if scratch.result.exists():
             target = self.root / outcome.output
             target.parent.mkdir(parents=True, exist_ok=True)
-            scratch.result.replace(target)
+            try:
+                scratch.result.replace(target)
+            except OSError as error:
+                if error.errno != errno.EXDEV:
+                    raise
+                with replacing(target) as temporary:
+                    shutil.copyfile(scratch.result, temporary)
             sync(target.parent)
         (folder / _RECORD).replace(self._record(outcome.output))
         sync(self._records)

@@ -12,7 +12,7 @@ from stillpath.cli.batch.local_workers import Failure, FileResult, Stopped
 from stillpath.cli.batch.output import Figures, Scratch, Trouble
 from stillpath.cli.batch.worker_pool import Found
 from stillpath.service.client import Client, ClientError
-from stillpath.service.jobs.problems import FILE_TITLES
+from stillpath.service.jobs.problems import FILE_TITLES, LIMIT_TITLES
 
 if TYPE_CHECKING:
     from stillpath.pipeline.options import Options
@@ -108,6 +108,8 @@ def _failure_of(error: ClientError) -> Failure:
     trouble: Trouble = "computer"
     if error.is_refused and error.problem.get("title") in FILE_TITLES:
         trouble = "file"
+    elif error.status == 500 or error.problem.get("title") in LIMIT_TITLES:
+        trouble = "work"
     elif error.status in _OF_REQUEST:
         trouble = "machine"
     return Failure(str(error), trouble)

@@ -23,6 +23,8 @@ __all__ = ["Watcher", "run_watch"]
 
 _AGAIN_S = (10.0, 30.0, 60.0, 300.0)
 """How long to wait before what was not the file's fault is tried once more."""
+_TRIES_OF_WORK = 2
+"""How often work is begun that broke: on a computer that prints it may disturb the print."""
 _STEP_S = 0.5
 
 _Signature = tuple[int, int, int]
@@ -36,6 +38,7 @@ class _Work:
     is_over: bool = False
     error: str = ""
     tries: int = 0
+    breaks: int = 0
     next_at: float = 0.0
 
 
@@ -137,15 +140,11 @@ class Watcher:
         for work in works:
             if work.future is None or not work.future.done():
                 continue
-            outcome, work.future, came = work.future.result(), None, True
+            outcome = _judged(work, work.future.result(), now)
+            work.future, came = None, True
             if outcome.state == "done":
                 self._tell(outcome)
-            work.error = outcome.error
-            work.is_over = outcome.state != "failed" or outcome.trouble == "file"
-            if not work.is_over:
-                work.next_at = now + _AGAIN_S[min(work.tries, len(_AGAIN_S) - 1)]
-                work.tries += 1
-            elif outcome.state == "failed" and is_same:
+            if outcome.state == "failed" and outcome.trouble == "file" and is_same:
                 with suppress(OSError):  # a full disk: the next start tries the file again
                     self._output.note(outcome.output, outcome)
             if work.error and work.error != seen.reported and is_same:
@@ -171,6 +170,21 @@ class Watcher:
                 with replacing(folder / name) as temporary:
                     temporary.write_text(f"{why}\n", encoding="utf-8")
                 return
+
+
+def _judged(work: _Work, outcome: Outcome, now: float) -> Outcome:
+    """Note in `work` what comes next; return the outcome as it is told."""
+    work.breaks += outcome.trouble == "work"
+    gives_up = outcome.trouble == "work" and work.breaks >= _TRIES_OF_WORK
+    work.is_over = outcome.state != "failed" or outcome.trouble == "file" or gives_up
+    if gives_up:
+        why = f"{outcome.error}; it is not tried again before the file changes or the next start"
+        outcome = outcome.model_copy(update={"error": why})
+    if not work.is_over:
+        work.next_at = now + _AGAIN_S[min(work.tries, len(_AGAIN_S) - 1)]
+        work.tries += 1
+    work.error = outcome.error
+    return outcome
 
 
 def run_watch(watcher: Watcher, folder: Path, *, every_s: float, check: Callable[[], None]) -> None:

@@ -16,6 +16,7 @@ from sqlalchemy import (
     Table,
     Text,
     UniqueConstraint,
+    false,
 )
 
 __all__ = [
@@ -84,6 +85,8 @@ jobs = Table(
     # What is computed.
     Column("kind", String(16), nullable=False, server_default="compensation"),
     Column("room_bytes", BigInteger),
+    # Whether a print that was asked for is not started after all.
+    Column("held_back", Boolean, nullable=False, server_default=false()),
     Index("jobs_by_state", "state", "priority", "created_at"),
     Index("jobs_by_owner", "owner", "created_at"),
     Index("jobs_by_age", "created_at"),

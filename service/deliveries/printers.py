@@ -160,10 +160,13 @@ def what_started(printer: Printer, reply: Reply) -> str | None:
         told: Any = json.loads(reply.text)
     except ValueError:
         return None
-    is_moonraker = printer.kind == "moonraker"
-    begun = "print_started" if is_moonraker else "effectivePrint"
+    if not isinstance(told, dict):
+        return None
     # Of a file that is no .gcode Moonraker starts none and says nothing; old OctoPrints never do.
-    if not isinstance(told, dict) or told.get(begun, not is_moonraker) is True:
+    # Moonraker answers in its own words also where it is sent to as an OctoPrint
+    # (components/octoprint_compat.py, application.py; 0.11).
+    silent_means = printer.kind != "moonraker"
+    if told.get("print_started", told.get("effectivePrint", silent_means)) is True:
         return None
     if told.get("print_queued"):
         return "uploaded; the printer put it into its queue"

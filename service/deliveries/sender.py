@@ -227,7 +227,7 @@ class Sender:
         job = self._store.get(claimed.job_id)
         if job is None:
             return "failed", "the job was deleted"
-        starts = claimed.kind == "printer" and job.print_after
+        starts = claimed.kind == "printer" and job.print_after and not job.held_back
         if starts and unknown_before:
             return "failed", _unknown("the service was stopped while it sent")
         try:
@@ -260,9 +260,8 @@ class Sender:
     def _send_to_printer(self, job: Job, name: str) -> tuple[str, str | None]:
         printer = printer_for(self._printers, name, start=job.print_after)
         warnings, unsafe = self._looked_at(printer, job)
-        # The age is unknown where a clock was set back.
-        late = abs(time.time() - (job.finished_at or 0.0)) > self._times.start_within_s
-        starts = job.print_after and not unsafe and not late
+        why_not = self._why_not_started(job, unsafe)
+        starts = job.print_after and why_not is None
         with contextlib.ExitStack() as copy:
             file = copy.enter_context(self._storage.local(job.result))
             if sha256_of(file) != job.result_sha256:
@@ -278,17 +277,28 @@ class Sender:
                 f"{error}; not tried again, because that would start a print later: send it again"
             )
         if state == "done":
-            told = begun
-            if job.print_after and unsafe:
-                told = "uploaded, but not started, because it may be unsafe"
-            elif job.print_after and late:
-                told = (
-                    "uploaded, but not started: it was done more than "
-                    f"{self._times.start_within_s:.0f} s ago, and nobody may be there; start it "
-                    "at the printer"
-                )
+            told = why_not if job.print_after and why_not else begun
             error = "; ".join([*([told] if told else ()), *unsafe, *warnings]) or None
         return state, error
+
+    def _why_not_started(self, job: Job, unsafe: list[str]) -> str | None:
+        """Return why a print is not started that was asked for, or None."""
+        if unsafe:
+            return "uploaded, but not started, because it may be unsafe"
+        if job.held_back:
+            return (
+                "uploaded, but not started: for an hour or more the job could not be done (no "
+                "service, no worker, or no room on the disk), and nobody may be there; start it at "
+                "the printer"
+            )
+        # The age is unknown where a clock was set back.
+        if abs(time.time() - (job.finished_at or 0.0)) > self._times.start_within_s:
+            return (
+                "uploaded, but not started: it was done more than "
+                f"{self._times.start_within_s:.0f} s ago, and nobody may be there; start it "
+                "at the printer"
+            )
+        return None
 
     def _looked_at(self, printer: Printer, job: Job) -> tuple[list[str], list[str]]:
         """Return findings about a printer, and those that make a print unsafe.

@@ -7,6 +7,7 @@ prefix of the valid one.
 from __future__ import annotations
 
 import contextlib
+import errno
 import functools
 import os
 import shutil
@@ -30,6 +31,7 @@ from stillpath.service.jobs.problems import (
     storage_away,
     storage_never_fits,
 )
+from stillpath.service.jobs.room import has_room_again
 from stillpath.service.jobs.state import Event, Failed, Finished, Job, Lost, OutOfRoom
 from stillpath.service.jobs.store import JobStore
 from stillpath.service.jobs.task import Runner, Task
@@ -39,6 +41,15 @@ from stillpath.service.storage import Storage, StorageError, sha256_of
 from stillpath.service.storage.disk import DISK_FULL, Disk, PeakDiskUse, written_bytes
 
 __all__ = ["Attempt", "WorkerContext"]
+
+_DISK_AWAY = tuple(
+    getattr(errno, name)
+    for name in ("EIO", "EROFS", "ESTALE", "ENODEV", "ENXIO", "ENOTCONN", "ETIMEDOUT", "EHOSTDOWN")
+    if hasattr(errno, name)
+)
+"""Error numbers of a disk that was pulled, broke down, or whose server is away."""
+_AGAIN_S = 5.0
+"""Delay before a job is given back that nothing can be stored for."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +110,9 @@ class Attempt:
 
         A full disk is not a failure: the job waits for room.
         """
+        if self._job.room_bytes and not has_room_again(self._job, self._disk, self._storage):
+            # Where workers have disks of their own only they know; to compute would be in vain.
+            return OutOfRoom(self._job.attempt, time.time())
         try:
             with _new_folder(self._folder):
                 try:
@@ -123,8 +137,8 @@ class Attempt:
             if error.errno in DISK_FULL:
                 return OutOfRoom(self._job.attempt, time.time())  # not even for its folder
             self._log_crash()
-            if isinstance(error, StorageError):
-                return self._lost_storage(error)
+            if isinstance(error, StorageError) or error.errno in _DISK_AWAY:
+                return self._lost_disk(error, watch)
             return self._failed(problem_of(error, self._job.kind))
         except Exception as error:
             found = problem_of(error, self._job.kind)
@@ -214,14 +228,18 @@ class Attempt:
     def _failed(self, problem: dict[str, Any]) -> Failed:
         return Failed(self._job.attempt, time.time(), problem)
 
-    def _lost_storage(self, error: StorageError) -> Lost:
-        """Return the event for a storage that is away: another attempt may succeed."""
+    def _lost_disk(self, error: OSError, watch: Watch) -> Lost:
+        """Return the event for a disk or storage that is away: another attempt may succeed."""
+        answers = self._storage_answers()
+        if not answers:
+            with contextlib.suppress(StopWork):
+                watch.pause(_AGAIN_S)
         return Lost(
             self._job.attempt,
             time.time(),
             str(error),
             self._settings.max_attempts,
-            blame=self._storage_answers(),  # while nothing is stored, it waits
+            blame=answers,  # while nothing is stored, it waits
             problem=storage_away(error),
         )
 

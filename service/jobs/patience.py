@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import math
 import time
 from collections.abc import Callable
 from typing import TypeVar
@@ -25,6 +26,8 @@ def patiently(
     action: Callable[[], _Given],
     trouble: type[Exception],
     pause: Callable[[float], None] = time.sleep,
+    *,
+    for_ever: bool = False,
 ) -> _Given:
     """Repeat `action` while it raises `trouble`, up to a limit; do not wait for a full disk.
 
@@ -32,8 +35,10 @@ def patiently(
     ----------
     pause : callable
         Waits for so many seconds; may raise to give up.
+    for_ever : bool
+        Whether there is no limit.
     """
-    deadline = time.monotonic() + _PATIENCE_S
+    deadline = math.inf if for_ever else time.monotonic() + _PATIENCE_S
     wait_s = _FIRST_PAUSE_S
     while True:
         try:

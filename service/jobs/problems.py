@@ -12,7 +12,11 @@ __all__ = [
     "FILE_EMPTY",
     "FILE_TITLES",
     "FILE_TOO_LARGE",
+    "LIMIT_TITLES",
     "PROBLEM_MEDIA_TYPE",
+    "TOO_LARGE_A_RESULT",
+    "TOO_LONG",
+    "TOO_MUCH_MEMORY",
     "input_damaged",
     "input_gone",
     "never_fits",
@@ -25,6 +29,11 @@ __all__ = [
 PROBLEM_MEDIA_TYPE = "application/problem+json"
 FILE_EMPTY = "The file is empty"
 FILE_TOO_LARGE = "File too large"
+TOO_LONG = "The job takes too long"
+TOO_MUCH_MEMORY = "The job needs too much memory"
+TOO_LARGE_A_RESULT = "The job is larger than the disk"
+LIMIT_TITLES = frozenset({TOO_LONG, TOO_MUCH_MEMORY, TOO_LARGE_A_RESULT})
+"""Titles of problems that the same job most likely has again, however often it is done."""
 _GCODE_REFUSED = "The G-code cannot be processed"
 FILE_TITLES = frozenset({FILE_EMPTY, FILE_TOO_LARGE, _GCODE_REFUSED})
 """Titles of problems (4xx) for which the uploaded file is to blame, and nothing else."""
@@ -126,7 +135,7 @@ def never_fits(room_bytes: int, total_bytes: int) -> dict[str, Any]:
     """Return the problem of a job whose files are larger than the disk."""
     return problem(
         507,
-        "The job is larger than the disk",
+        TOO_LARGE_A_RESULT,
         f"It had written {room_bytes >> 20} MiB when the disk was full; the disk of the worker has "
         f"{total_bytes >> 20} MiB in all, and some stay free (STILLPATH_DISK_RESERVE_BYTES). "
         f"{_SMALLER}, or give the service a larger disk.",
@@ -137,7 +146,7 @@ def storage_never_fits(room_bytes: int, total_bytes: int) -> dict[str, Any]:
     """Return the problem of a job whose result is larger than the disk of the storage."""
     return problem(
         507,
-        "The job is larger than the disk",
+        TOO_LARGE_A_RESULT,
         f"Its result has {room_bytes >> 20} MiB, and the disk of the storage {total_bytes >> 20} "
         f"MiB in all (STILLPATH_STORAGE_URL). {_SMALLER}, or give the storage a larger disk.",
     )

@@ -36,6 +36,10 @@ _TICK_S = 0.5
 _SWEEP_EVERY_S = 60.0
 _GIVE_BACK_S = 1.5
 """Time for a closing worker to give its job back; it checks twice a second."""
+_FORGIVEN_ENDS = 2
+"""How often a job may have been under way when its service was killed or lost power before it is
+suspected: a job that takes all memory of a small computer would freeze it after each start."""
+_ENDED = "the service or the computer went down while the job was under way"
 _RETRY_S, _LONGEST_RETRY_S = 0.5, 5.0
 _OWN_GRACE_S, _GRACE_S = 60.0, 5.0
 """Time for which our own workers, which restart by themselves, and remote ones may be away before
@@ -71,6 +75,7 @@ class Reconciler:
         self._broken_since: dict[str, float] = {}
         self._has_lease = False
         self._leased_at = self._awake_at = 0.0
+        self._able_at = _since_boot_s()
         # By the clock: when we began to be the service that runs.
         self._began_at = time.time()
         # Free slots after the last check; None during one.
@@ -184,20 +189,36 @@ class Reconciler:
             self._has_lease = self._store.lease(_LEASE, self._holder, _LEASE_S, time.time())
             self._leased_at, self._awake_at = now, _since_boot_s()
             if not had_lease:
-                self._began_at = time.time()
+                self._began_at, self._able_at = time.time(), self._awake_at
 
     def _hold_back_starts(self) -> None:
         """After a long time without a service, start no print that nobody expects any more.
 
         A clock that is put right while we run (a board without a battery, once it has a network)
-        says so of the time before we began: what was submitted since is expected.
+        says so of the time before we began: what was submitted since is expected. Where a clock
+        was set back before we began (such a board, after a power cut), nobody knows how long that
+        was.
         """
-        latest = time.time() - START_WITHIN_S
-        if self._store.leased_until(_LEASE) < latest:
-            ran = self._has_lease and _since_boot_s() - self._awake_at < START_WITHIN_S
+        now = time.time()
+        latest = now - START_WITHIN_S
+        until = self._store.leased_until(_LEASE)
+        ran = self._has_lease and _since_boot_s() - self._awake_at < START_WITHIN_S
+        jobs = 0
+        if until < latest:
             jobs = self._store.hold_back_starts(min(latest, self._began_at) if ran else latest)
+        elif not ran and until > now + START_WITHIN_S:
+            jobs = self._store.hold_back_starts(self._began_at, now)
+        if jobs:
+            self._log.warning("prints will not be started: no service was running", jobs=jobs)
+
+    def _note_able(self) -> None:
+        """Note that jobs can be done; after a long time without workers or room, start no print."""
+        now_s = _since_boot_s()
+        if now_s - self._able_at > START_WITHIN_S:
+            jobs = self._store.hold_back_starts(time.time() - START_WITHIN_S)
             if jobs:
-                self._log.warning("prints will not be started: no service was running", jobs=jobs)
+                self._log.warning("prints will not be started: no job could be done", jobs=jobs)
+        self._able_at = now_s
 
     def _take_over(self) -> None:
         """Requeue what ran when the previous service ended, together with its workers.
@@ -207,7 +228,8 @@ class Reconciler:
         """
         if self._store.engine.dialect.name == "sqlite":
             for job in self._store.in_state(JobState.RUNNING):
-                self._give_back(job.id, job.attempt, "the service ended", blame=False)
+                suspect = job.attempt > _FORGIVEN_ENDS
+                self._give_back(job.id, job.attempt, _ENDED, blame=suspect)
         self._took_over = True
 
     def _find_silent(self) -> None:
@@ -218,7 +240,8 @@ class Reconciler:
             reason = f"nothing was heard of its worker {job.worker} for {timeout_s:g} s"
             # Our own workers end with their service: an earlier one began what we did not.
             ended = self._cluster.is_own and job.id not in self._in_flight
-            self._give_back(job.id, job.attempt, reason, blame=not ended)
+            blame = not ended or job.attempt > _FORGIVEN_ENDS
+            self._give_back(job.id, job.attempt, _ENDED if ended else reason, blame=blame)
 
     def _collect(self) -> None:
         """Drop finished futures; a job that is still running then has lost its worker.
@@ -261,10 +284,13 @@ class Reconciler:
 
         Not more: a job already waiting at Dask could not be overtaken by a more urgent one.
         """
+        has_room = self._room.for_any()
+        if self.slots and has_room:
+            self._note_able()
         busy = {job.id: job for job in self._store.in_state(JobState.RUNNING)}
         busy |= {job_id: job for job_id, (job, _) in self._in_flight.items()}
         free = self.slots - len(busy)
-        if free > 0 and self._room.for_any():
+        if free > 0 and has_room:
             # Short jobs may use any slot; some slots are reserved for them.
             long = sum(not job.kind.is_short for job in busy.values())
             kept = min(self._settings.computing_processes, self.slots - 1)

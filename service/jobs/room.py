@@ -9,15 +9,13 @@ import structlog
 
 from stillpath.service.jobs.state import Job
 from stillpath.service.storage import Storage, StorageError
-from stillpath.service.storage.disk import Disk
+from stillpath.service.storage.disk import Disk, room_again_bytes
 
-__all__ = ["RoomForJobs"]
+__all__ = ["RoomForJobs", "has_room_again"]
 
 _MOST_REMEMBERED = 10_000
 _NO_ROOM_S = 30.0
 """Delay before a job whose files had no room is retried: others may need less."""
-_ROUNDING_BYTES = 1 << 20
-"""Margin for disk blocks and directory entries."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,17 +66,19 @@ class RoomForJobs:
         waited = wait is not None and wait.attempt == job.attempt
         if wait is not None and waited and wait.until_s > now_s:
             return False
-        if waited and (not self._is_own_disk or self._for_bytes(job.room_bytes or 0)):
+        if waited and (not self._is_own_disk or has_room_again(job, self._disk, self._storage)):
             return True
         if len(self._waits) > _MOST_REMEMBERED:
             self._waits.clear()
         self._waits[job.id] = _Wait(job.attempt, now_s + _NO_ROOM_S)
         return False
 
-    def _for_bytes(self, more_bytes: int) -> bool:
-        """Return whether so much has room, on our disk and on that of the storage."""
-        room = None
-        with contextlib.suppress(StorageError):  # the workers will notice
-            room = self._storage.room()
-        stored = room is None or room.free_bytes >= more_bytes + _ROUNDING_BYTES
-        return stored and self._disk.has_room_for(more_bytes)
+
+def has_room_again(job: Job, disk: Disk, storage: Storage) -> bool:
+    """Return whether a job that had no room has it now, on this disk and on the storage's."""
+    more_bytes = room_again_bytes(job.room_bytes or 0)
+    if not disk.has_room_for(more_bytes):
+        return False
+    with contextlib.suppress(StorageError):  # the worker will notice
+        return storage.takes(more_bytes)
+    return True

@@ -41,8 +41,8 @@ __all__ = [
 ]
 
 START_WITHIN_S = 3600.0
-"""How long after its job ended, or after the service was last running, a print may still start:
-later nobody may be there to watch."""
+"""How long after its job ended, or after jobs could last be done, a print may still start: later
+nobody may be there to watch."""
 WAITING_FOR_ROOM = "waiting for room on the disk"
 """Stage of a requeued job whose files had no room."""
 
@@ -125,6 +125,8 @@ class Job:
         Address that is notified when the job ends.
     printer, print_after : str or None, bool
         Printer that the result is uploaded to, and whether it then starts to print.
+    held_back : bool
+        Whether it does not start after all: for too long nobody could do the job.
     """
 
     id: str
@@ -161,6 +163,7 @@ class Job:
     webhook: str | None = None
     printer: str | None = None
     print_after: bool = False
+    held_back: bool = False
 
     @property
     def sources(self) -> list[str]:
@@ -206,7 +209,7 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class Claimed:
-    """A worker takes the job."""
+    """A worker takes the job; a print is held back if it waited long for disk space."""
 
     at: float
     worker: str
@@ -342,8 +345,10 @@ def advance(job: Job, event: Event) -> Job:
 
 
 def _running(job: Job, event: Claimed) -> Job:
+    late = job.waits_for_room and abs(event.at - job.created_at) > START_WITHIN_S
     return replace(
         job,
+        held_back=job.held_back or (job.print_after and late),
         state=JobState.RUNNING,
         attempt=job.attempt + 1,
         worker=event.worker,

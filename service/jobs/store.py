@@ -9,6 +9,7 @@ from __future__ import annotations
 import base64
 import json
 import math
+import uuid
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -48,6 +49,8 @@ from stillpath.service.jobs.submissions import Quota, same_job, submission, subm
 __all__ = ["BadCursor", "JobListing", "JobStore"]
 
 _JOBS = tables.jobs.c
+_IDENTITY = "database"
+"""Lease that nobody gives up: its holder is the database's name."""
 _CLOCKS_APART = 12
 """A lease that exceeds its duration by this factor dates from before the clock was set."""
 
@@ -341,10 +344,14 @@ class JobStore:
         heard = func.coalesce(_JOBS.heartbeat_at, _JOBS.started_at, 0.0)
         return self._jobs(select(tables.jobs).where(_JOBS.state == "running", heard < before))
 
-    def hold_back_starts(self, before: float) -> int:
-        """Let unfinished jobs that were submitted before a time start no printer; count them."""
-        waits = (_JOBS.state.not_in(OVER), _JOBS.print_after, _JOBS.created_at < before)
-        return self._count(update(tables.jobs).where(*waits).values(print_after=False))
+    def hold_back_starts(self, before: float, after: float = math.inf) -> int:
+        """Let unfinished jobs start no printer that were submitted before a time; count them.
+
+        Likewise those submitted after the time `after`, by a clock that was set back since.
+        """
+        old = or_(_JOBS.created_at < before, _JOBS.created_at > after)
+        waits = (_JOBS.state.not_in(OVER), _JOBS.print_after, ~_JOBS.held_back, old)
+        return self._count(update(tables.jobs).where(*waits).values(held_back=True))
 
     # Deleting
 
@@ -393,6 +400,19 @@ class JobStore:
         with reading(self.engine) as connection:
             query = select(leases.expires_at).where(leases.name == name)
             return float(connection.execute(query).scalar() or 0.0)
+
+    def identity(self) -> str:
+        """Return the name of this database, which is random and stays."""
+        row = {"name": _IDENTITY, "holder": uuid.uuid4().hex, "expires_at": 0.0}
+        query = select(tables.leases.c.holder).where(tables.leases.c.name == _IDENTITY)
+        with reading(self.engine) as connection:
+            known = connection.execute(query).scalar()
+        if known is None:
+            with writing(self.engine) as connection:
+                named = insert(connection, tables.leases).values(row).on_conflict_do_nothing()
+                connection.execute(named)
+                known = connection.execute(query).scalar_one()
+        return str(known)
 
     # Private
 

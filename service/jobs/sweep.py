@@ -14,6 +14,7 @@ import structlog
 from stillpath.service.database.engine import DatabaseAway, DatabaseFull
 from stillpath.service.jobs.expiry import Expiry
 from stillpath.service.jobs.state import Job, JobState
+from stillpath.service.jobs.storage_owner import StorageOwner
 from stillpath.service.jobs.store import JobStore
 from stillpath.service.settings import Settings
 from stillpath.service.storage import Stat, Storage
@@ -58,6 +59,8 @@ class Sweep:
         self._expiry = Expiry(store.engine)
         self._disk = Disk(settings.data_dir, settings.disk_reserve_bytes)
         self._counted_at: float | None = None
+        # A folder of data has one service at a time (`service.instance_lock`).
+        self._owner = settings.storage_url and StorageOwner(store, storage, settings.data_dir)
         self._orphans: dict[str, float] = {}
         self._uploads: dict[tuple[str, int, float], float] = {}
 
@@ -99,8 +102,11 @@ class Sweep:
     def _sweep_orphans(self) -> None:
         now, before = self._clock(), self._orphans
         self._orphans = {}
+        is_alone = not self._owner or self._owner.is_alone()
 
         def is_old(job_id: str) -> bool:
+            if not is_alone:
+                return False
             self._orphans[job_id] = before.get(job_id, now)
             return now - self._orphans[job_id] > _ORPHAN_S
 

@@ -18,7 +18,7 @@ import structlog
 
 from stillpath.pipeline.progress import Progress, StopWork
 from stillpath.service.database.engine import DatabaseAway
-from stillpath.service.jobs.problems import problem
+from stillpath.service.jobs.problems import TOO_LONG, TOO_MUCH_MEMORY, problem
 from stillpath.service.jobs.state import Event, Failed, Job, JobKind, Lost, OutOfRoom
 from stillpath.service.jobs.store import JobStore
 from stillpath.service.settings import Settings
@@ -68,7 +68,7 @@ class AttemptLimits:
         """Return the problem of a job that took too long."""
         return problem(
             422,
-            "The job takes too long",
+            TOO_LONG,
             f"It was stopped after {seconds:.0f} s; the limit is {self.max_s:g} s "
             f"({self.seconds_setting}). {self.remedy}, or have the limit raised.",
         )
@@ -77,7 +77,7 @@ class AttemptLimits:
         """Return the problem of a job that needs too much memory; `what` happened."""
         return problem(
             422,
-            "The job needs too much memory",
+            TOO_MUCH_MEMORY,
             f"{what}; the limit is {self.max_bytes // _MIB} MiB ({self.bytes_setting}). "
             f"{self.remedy}, or have the limit raised.",
         )

@@ -5,6 +5,7 @@ Only the job's id passes through Dask; everything else is read from database and
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import json
 import pkgutil
@@ -15,13 +16,13 @@ from typing import Any
 
 import structlog
 
-from stillpath.pipeline.progress import Progress
+from stillpath.pipeline.progress import Progress, StopWork
 from stillpath.service.database.engine import DatabaseAway, StoreError, open_database
 from stillpath.service.environment import prepare_environment
 from stillpath.service.jobs.attempt import Attempt, WorkerContext
 from stillpath.service.jobs.computations import run_computation
 from stillpath.service.jobs.patience import patiently
-from stillpath.service.jobs.state import JobKind
+from stillpath.service.jobs.state import Event, JobKind
 from stillpath.service.jobs.store import JobStore
 from stillpath.service.jobs.task import Runner, Task
 from stillpath.service.jobs.watch import AttemptLimits, Watch, held_bytes
@@ -92,14 +93,33 @@ def execute(job_id: str, context: WorkerContext, runner: Runner) -> None:
         with watch:
             event = attempt.run(runner, watch)
         # A decision of the watch that was not stored yet comes first.
-        for said in (watch.verdict, event):
-            if said is not None:
-                # If the database fails after storing the event, the retry is stale and harmless.
-                patiently(functools.partial(store.apply, job.id, said), DatabaseAway)
+        with contextlib.suppress(StopWork):
+            for said in (watch.verdict, event):
+                if said is not None:
+                    _record(job.id, said, context)
         attempt.tidy()
         log.info("job over", outcome="dropped" if event is None else type(event).__name__)
     if watch.outgrown or (job.kind.is_short and held_bytes() > _MOST_KEPT_BYTES):
         context.end(0)
+
+
+def _record(job_id: str, event: Event, context: WorkerContext) -> None:
+    """Record what became of a job, however long the database is away: it may have taken hours.
+
+    Raises
+    ------
+    StopWork
+        If the worker has to end.
+    """
+
+    def pause(seconds: float) -> None:
+        time.sleep(seconds)
+        if context.interrupted() is not None:
+            raise StopWork
+
+    # If the database fails after storing the event, the retry is stale and harmless.
+    apply = functools.partial(context.store.apply, job_id, event)
+    patiently(apply, DatabaseAway, pause, for_ever=True)
 
 
 def run_compensation(task: Task, progress: Callable[[Progress], None]) -> dict[str, Any]:

@@ -99,5 +99,8 @@ class Storage(Protocol):
     def room(self) -> Room | None:
         """Return the space of its disk; None if unknown."""
 
+    def takes(self, more_bytes: int) -> bool:
+        """Return whether there is room for so much now, as far as that can be known."""
+
     def check(self) -> None:
         """Raise `StorageError` unless a file could be written now."""

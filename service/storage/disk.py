@@ -14,12 +14,23 @@ import structlog
 
 from stillpath.service.permissions import private_folder
 
-__all__ = ["DISK_FULL", "Disk", "NoRoom", "PeakDiskUse", "refuses_more", "written_bytes"]
+__all__ = [
+    "DISK_FULL",
+    "Disk",
+    "NoRoom",
+    "PeakDiskUse",
+    "refuses_more",
+    "room_again_bytes",
+    "takes",
+    "written_bytes",
+]
 
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 """Error numbers of a full disk."""
 
 _MIB = 1 << 20
+_MOST_UNSEEN_BYTES = 256 * _MIB
+"""What a job may write between two looks at it."""
 _BALLAST = "disk-reserve"
 _BALLAST_BYTES = 8 * _MIB
 
@@ -74,9 +85,10 @@ class Disk:
 
     def has_room_for(self, more_bytes: int) -> bool:
         """Return whether a job may begin that needs so much."""
-        if not self._reserve_bytes:
-            return True
-        return self.free_bytes() - more_bytes >= self._reserve_bytes // 4 and self.lets_jobs_begin
+        reserve_bytes = self._reserve_bytes
+        if reserve_bytes and self.free_bytes() - more_bytes < reserve_bytes // 4:
+            return False
+        return self.lets_jobs_begin and takes(self._folder, more_bytes)
 
     def check_ever(self, job_bytes: int) -> None:
         """Raise `NoRoom` if the files of a job are larger than the disk."""
@@ -180,6 +192,30 @@ def refuses_more(folder: Path) -> bool:
     except OSError as error:
         return error.errno in DISK_FULL
     return False
+
+
+def takes(folder: Path, more_bytes: int) -> bool:
+    """Return whether a folder has room for so much now, also of a quota: nothing else tells.
+
+    The space is asked for and given back; nothing is written where the file system knows how.
+    """
+    if not hasattr(os, "posix_fallocate"):  # macOS, Windows
+        return True
+    try:
+        with tempfile.TemporaryFile(dir=folder) as file:
+            os.posix_fallocate(file.fileno(), 0, max(more_bytes, 1))
+    except OSError as error:
+        return error.errno not in DISK_FULL
+    return True
+
+
+def room_again_bytes(room_bytes: int) -> int:
+    """Return how much room a job is to find that had written `room_bytes` when there was no more.
+
+    It needs more than that, and what it wrote last was not seen: with no more than that it would
+    begin and end without room for ever.
+    """
+    return room_bytes + min(room_bytes // 8, _MOST_UNSEEN_BYTES) + _MIB
 
 
 def written_bytes(folder: Path) -> int:

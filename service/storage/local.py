@@ -12,6 +12,7 @@ from pathlib import Path
 
 from stillpath.pipeline.files import sync
 from stillpath.service.storage.base import Room, Stat, StorageError
+from stillpath.service.storage.disk import takes
 from stillpath.service.storage.keys import check_key, check_prefix
 from stillpath.service.storage.leftovers import delete_leftovers
 
@@ -114,6 +115,11 @@ class LocalStorage:
         with self._there():
             usage = shutil.disk_usage(self._root)
         return Room(usage.free, usage.total)
+
+    def takes(self, more_bytes: int) -> bool:
+        """Return whether the folder has room for so much; see `Storage.takes`."""
+        with self._there():
+            return takes(self._root / _FRESH, more_bytes)
 
     def check(self) -> None:
         """Write a file of some kB and delete it; see `Storage.check`."""

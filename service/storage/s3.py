@@ -138,6 +138,10 @@ class S3Storage:
     def room(self) -> None:
         """Return None: a bucket does not say; see `Storage.room`."""
 
+    def takes(self, more_bytes: int) -> bool:  # noqa: ARG002
+        """Return True: only the upload tells; see `Storage.takes`."""
+        return True
+
     def check(self) -> None:
         """Write an empty file and delete it; see `Storage.check`."""
         import obstore

@@ -403,6 +403,27 @@ def test_a_program_does_the_work(bench: Callable[..., Bench], tmp_path: Path):
     assert "compensating" in here.stages
 
 
+def test_what_freezes_the_computer_is_not_begun_for_ever(
+    bench: Callable[..., Bench], tmp_path: Path
+):
+    """Somebody switches it off and on; the list is then as it was in the middle of the work."""
+    slow = _program(tmp_path, "time.sleep(60)")
+    here = bench(command=slow)
+    entry = here.add("a.gcode", "G1\n")
+    kept = tmp_path / "list.json"
+    for number in (1, 2, 3):
+        told = f'"begun": {number}'
+        until(lambda told=told: told in kept.read_text())
+        frozen = kept.read_text()
+        here.worker.stop(60)
+        assert entry.begun == 0  # an orderly end
+        kept.write_text(frozen)
+        here = bench(command=slow)
+        (entry,) = here.book.entries()
+    assert here.ended(entry).state == "failed"
+    assert "went down 3 times while it was processed" in entry.message
+
+
 def test_a_result_without_a_report_is_kept(bench: Callable[..., Bench], tmp_path: Path):
     """As the program does it where there is no room for the report: exit code 0."""
     here = bench(command=_program(tmp_path, _WORKS.partition("report =")[0]))

@@ -13,6 +13,7 @@ from stillpath.service.jobs.state import (
     Event,
     JobState,
     Lost,
+    OutOfRoom,
     Progressed,
     Stale,
     advance,
@@ -60,6 +61,17 @@ def test_a_lost_worker_is_forgiven_once():
     assert over.problem is not None
     assert "signal 9" in over.problem["detail"]
     assert "2 times" in over.problem["detail"]
+
+
+def test_a_print_that_waited_long_for_room_is_held_back():
+    """Nobody may be there to watch; a queue that is honestly long is expected."""
+    asked = make_job(id="a", printer="m", print_after=True, created_at=0.0)
+    began = advance(asked, Claimed(9000.0, "w"))
+    assert not began.held_back
+    waits = advance(began, OutOfRoom(1, 9001.0, 5))
+    assert advance(waits, Claimed(9100.0, "w")).held_back
+    soon = advance(replace(waits, created_at=9000.0), Claimed(9100.0, "w"))
+    assert not soon.held_back
 
 
 def test_a_stopped_service_is_not_the_jobs_fault():

@@ -283,7 +283,7 @@ class StillpathPlugin(
 def _view(entry: Entry) -> dict[str, Any]:
     """Return an entry as pages show it."""
     shown = asdict(entry)
-    for name in ("server", "is_ours", "tries", "version"):
+    for name in ("server", "is_ours", "tries", "begun", "version"):
         del shown[name]
     shown["is_over"] = entry.is_over
     return shown

@@ -54,6 +54,8 @@ class Entry:
         Of this entry; no other text may name it in an address.
     tries : int
         How many jobs of it were given up; each makes the next one another request for the server.
+    begun : int
+        How often a program of this computer began with it and no orderly end followed.
     is_cancelled : bool
         Its end was asked for while it was worked on.
     version : list of int
@@ -76,6 +78,7 @@ class Entry:
     result: str = ""
     has_report: bool = False
     tries: int = 0
+    begun: int = 0
     is_cancelled: bool = False
     version: list[int] = field(default_factory=list)
     at: float = field(default_factory=time.time)

@@ -23,6 +23,7 @@ __all__ = ["Cancelled", "Host", "Worker"]
 
 _SHOWN_EVERY_S = 0.5
 _LOOKS_EVERY_S = 1.0
+_MOST_BEGINNINGS = 3
 
 
 class Cancelled(Exception):
@@ -112,6 +113,7 @@ class Worker:
         try:
             self._attempt(entry)
         except _Stopped:
+            change(entry, begun=0)
             raise
         except Cancelled:
             change(entry, state="cancelled", stage="", progress=None)
@@ -136,6 +138,7 @@ class Worker:
         try:
             source = self._source(entry)
             self._wait_while(entry, self._host.busy_with)
+            self._note_begun(entry)
             digest = self._digest(entry, source)
             self._folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryDirectory(dir=str(self._folder)) as folder:
@@ -147,6 +150,17 @@ class Worker:
         except Cancelled:
             compensator.cancel()  # also a job that an earlier run of OctoPrint has left
             raise
+
+    def _note_begun(self, entry: Entry) -> None:
+        """Count beginnings on this computer: one that the work freezes is switched off and on."""
+        if entry.where != "command":
+            return
+        if entry.begun >= _MOST_BEGINNINGS:
+            raise Failure(
+                f"this computer or OctoPrint went down {entry.begun} times while it was processed, "
+                "perhaps for want of memory; let a server do it, or ask for it again"
+            )
+        self._ledger.change(entry, begun=entry.begun + 1)
 
     def _source(self, entry: Entry) -> Path:
         self._check(entry)  # an entry whose file is deleted is cancelled

@@ -6,5 +6,5 @@ compares the two.
 
 __all__ = ["LATEST"]
 
-LATEST = "0003"
+LATEST = "0004"
 """Revision that `service.database.tables` describes."""

@@ -32,6 +32,8 @@ class PretendedWorker:
             raise failure_of(GcodeError("X1e400 is too large", line=7, text="G1 X1e400"))
         if word == "full":
             raise Failure("the disk is full", "computer")
+        if word == "huge":
+            raise failure_of(MemoryError())
         task.result.write_text(f"; compensated for {task.machine.name}\n{task.source.read_text()}")
         task.report.mkdir()
         (task.report / "report.html").write_text("<p>report")

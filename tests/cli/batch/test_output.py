@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import stat
 from pathlib import Path
 
 import pytest
 
 from stillpath.cli.batch.output import Figures, Outcome, OutputFolder, sha256_of
+from stillpath.service.storage.local import LocalStorage
 
 TEXT = "; compensated\nG28\n"
 
@@ -71,8 +74,60 @@ def test_what_file_managers_leave_is_no_obstacle(tmp_path):
         done(output, "; the next one\n")
 
 
+def test_a_file_system_that_syncs_no_folders(tmp_path, monkeypatch):
+    """As fsync(2) of VirtualBox's shared folders answers; of files it may not fail."""
+    fsync = os.fsync
+
+    def of_files(handle):
+        if stat.S_ISDIR(os.fstat(handle).st_mode):
+            raise OSError(errno.EINVAL, "Invalid argument")
+        fsync(handle)
+
+    monkeypatch.setattr(os, "fsync", of_files)
+    with OutputFolder.opened(tmp_path) as output:
+        assert output.is_there(done(output))
+    storage = LocalStorage(tmp_path / "storage")
+    upload = tmp_path / "upload"
+    upload.write_text(TEXT)
+    storage.put("jobs/a/source/a.gcode", upload)
+    assert storage.stat("jobs/a/source/a.gcode").size_bytes == len(TEXT)
+
+
+@pytest.fixture(name="other_disk")
+def printers_shares(monkeypatch):
+    """Results and reports lie on other disks than what is worked on: shares of printers, say."""
+    replace = Path.replace
+
+    def across(path, target):
+        if ".stillpath" in path.parts and ".stillpath" not in Path(target).parts:
+            raise OSError(errno.EXDEV, "Invalid cross-device link", str(path))
+        return replace(path, target)
+
+    monkeypatch.setattr(Path, "replace", across)
+
+
+@pytest.mark.usefixtures("other_disk")
+def test_a_share_that_is_away_keeps_nothing_else_from_starting(tmp_path, monkeypatch):
+    def away(*_, **__):
+        raise OSError(errno.EHOSTDOWN, "Host is down")
+
+    with monkeypatch.context() as network, OutputFolder.opened(tmp_path) as output:
+        network.setattr("stillpath.cli.batch.output.shutil.copyfile", away)
+        with pytest.raises(OSError, match="Host is down"):
+            done(output)
+    with monkeypatch.context() as network:
+        network.setattr("stillpath.cli.batch.output.shutil.copyfile", away)
+        with OutputFolder.opened(tmp_path) as output:
+            assert output.recorded("m/a.stillpath.gcode") is None
+    with OutputFolder.opened(tmp_path) as output:
+        assert output.is_there(output.recorded("m/a.stillpath.gcode"))
+
+
+@pytest.mark.parametrize("apart", [False, True])
 @pytest.mark.parametrize("step", range(12))
-def test_killed_at_any_step(step, tmp_path, monkeypatch):
+def test_killed_at_any_step(step, apart, tmp_path, monkeypatch, request):
+    if apart:
+        request.getfixturevalue("other_disk")
     left = step
     with OutputFolder.opened(tmp_path) as output:
         done(output, "; before\n")

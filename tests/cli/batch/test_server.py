@@ -18,10 +18,14 @@ from stillpath.service.client import ClientError
 from stillpath.service.jobs.problems import (
     FILE_EMPTY,
     FILE_TOO_LARGE,
+    TOO_LONG,
+    TOO_MUCH_MEMORY,
     input_damaged,
     input_gone,
+    never_fits,
     problem,
     problem_of,
+    storage_away,
 )
 from tests.service.machines import make_machine, with_accel
 from tests.service.test_server import PRETEND, server
@@ -101,6 +105,11 @@ def test_a_batch_through_a_server(tmp_path, monkeypatch):
         (problem(422, "Invalid parameter", ""), "machine"),
         (problem(401, "Unauthorized", ""), "machine"),
         (problem(409, "Job cancelled", ""), "computer"),
+        (problem(422, TOO_LONG, ""), "work"),
+        (problem(422, TOO_MUCH_MEMORY, ""), "work"),
+        (never_fits(1, 1), "work"),
+        (problem_of(RuntimeError()), "work"),
+        (storage_away(OSError()), "computer"),
         (input_gone("part.gcode"), "computer"),
         (input_damaged("part.gcode"), "computer"),
         (problem(429, "Quota exceeded", ""), "computer"),
@@ -108,7 +117,7 @@ def test_a_batch_through_a_server(tmp_path, monkeypatch):
     ids=lambda value: value if isinstance(value, str) else value["title"],
 )
 def test_whose_fault_a_refusal_is(problem, trouble):
-    """Only what is the file's own fault is not tried again by `watch`."""
+    """What is the file's own fault is not tried again by `watch`, broken work once."""
     assert _failure_of(ClientError("why", problem["status"], problem)).trouble == trouble
 
 

@@ -204,6 +204,28 @@ def test_trouble_is_tried_again(folder):
         assert not (folder / "a.gcode.error.txt").exists()
 
 
+def test_work_that_breaks_is_not_begun_for_ever(folder):
+    """Of a printer's own computer each time may take the memory that the print needs."""
+    with watching(folder) as watch:
+        (folder / "a.gcode").write_text("huge")
+        watch.until_quiet()
+        tries = PretendedWorker.tries
+        assert "out of memory" in (folder / "a.gcode.error.txt").read_text()
+        for _ in range(10):
+            watch.look(300)
+            watch.until_quiet()
+        assert PretendedWorker.tries == tries + 1
+        assert (
+            "not tried again before the file changes" in (folder / "a.gcode.error.txt").read_text()
+        )
+        (folder / "a.gcode").write_text("G28")
+        assert [o.state for o in watch.until_quiet()] == ["done"]
+    (folder / "b.gcode").write_text("huge")
+    for _ in range(2):
+        with watching(folder) as watch:
+            assert [o.trouble for o in watch.until_quiet()] == ["work"]
+
+
 def test_a_revision_must_be_approved(folder):
     store = MachineStore(folder.parent / "machines")
     store.add_revision("mine", make_machine("mine"), author="me", message="")

@@ -149,6 +149,21 @@ def test_a_printer_that_does_not_begin_is_told(tmp_path: Path, kind: str):
     assert "did not begin" in (delivery.error or "")
 
 
+def test_a_moonraker_in_the_place_of_an_octoprint_tells_in_its_own_words(tmp_path: Path):
+    """Its octoprint_compat takes uploads to /api/files/local, as slicers send them."""
+    said = {"item": {"path": "part.gcode", "root": "gcodes"}, "action": "create_file"}
+
+    def delivered_where(began: bool) -> Delivery:
+        answer = json.dumps(said | {"print_started": began, "print_queued": False}).encode()
+        with Listener(lambda _: (201, {}, answer)) as server:
+            folder = tmp_path / str(began)
+            folder.mkdir()
+            return delivered(folder, server, "octoprint", prints=True, start=True)[1]
+
+    assert "did not begin" in (delivered_where(False).error or "")
+    assert delivered_where(True).error is None
+
+
 def _stored(_: Seen):
     return 201, {}, b'{"item": {"path": "part.bgcode"}, "action": "create_file"}'
 
@@ -205,6 +220,20 @@ def test_a_print_that_comes_late_is_not_started(tmp_path: Path):
             delivery = place.settled(job)
     assert delivery.state == "done"
     assert "not started" in (delivery.error or "")
+    assert uploads(server)[0].parts()["print"][1] == b"false"
+
+
+def test_a_print_that_was_held_back_is_told(tmp_path: Path):
+    """No service ran for days before the job was done."""
+    with (
+        moonraker() as server,
+        at(tmp_path, printer("m", "moonraker", server.url, start=True)) as place,
+    ):
+        job = place.finish(tmp_path, printer="m", print_after=True, held_back=True)
+        with place.sending():
+            delivery = place.settled(job)
+    assert delivery.state == "done"
+    assert "not started: for an hour or more the job could not be done" in (delivery.error or "")
     assert uploads(server)[0].parts()["print"][1] == b"false"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import shutil
 import time
 from dataclasses import dataclass, field
@@ -12,14 +13,19 @@ from typing import Any
 import pytest
 
 from stillpath.pipeline.progress import Progress
-from stillpath.service.jobs import patience
+from stillpath.service.database.engine import DatabaseAway
+from stillpath.service.jobs import attempt, patience
 from stillpath.service.jobs.attempt import WorkerContext
-from stillpath.service.jobs.state import WAITING_FOR_ROOM, Job, JobState, Lost
+from stillpath.service.jobs.room import RoomForJobs
+from stillpath.service.jobs.state import WAITING_FOR_ROOM, Finished, Job, JobState, Lost
 from stillpath.service.jobs.watch import STUCK_EXIT_CODE
 from stillpath.service.jobs.worker import execute
 from stillpath.service.storage import StorageError
+from stillpath.service.storage.disk import Disk
 from tests.service.jobs.site import Site, until
 from tests.service.runners import light
+
+_RESULT_BYTES = 3 << 20
 
 
 @dataclass
@@ -199,8 +205,30 @@ def test_a_storage_that_stays_away_is_the_reason_in_the_end(
     assert "memory" not in job.problem["detail"]
 
 
+@pytest.mark.parametrize("stopped", [False, True])
+def test_what_took_hours_waits_for_a_database_that_is_away(
+    site: Site, monkeypatch: pytest.MonkeyPatch, stopped: bool
+):
+    """As while PostgreSQL is moved to another computer."""
+    monkeypatch.setattr(patience, "_PATIENCE_S", 0.0)
+    bench, apply, away = Bench(site), site.store.apply, 3
+
+    def later(job_id: str, event: Any) -> Any:
+        nonlocal away
+        if isinstance(event, Finished) and away:
+            away -= 1
+            bench.reason = "the worker was stopped" if stopped else None
+            raise DatabaseAway("no connection")
+        return apply(job_id, event)
+
+    monkeypatch.setattr(site.store, "apply", later)
+    job = bench.run(site.submit("G1"))
+    assert (job.state, away) == ((JobState.RUNNING, 2) if stopped else (JobState.DONE, 0))
+
+
 def test_a_job_waits_for_a_disk_that_is_away(site: Site, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(patience, "_PATIENCE_S", 0.0)
+    monkeypatch.setattr(attempt, "_AGAIN_S", 0.0)
     job_id = site.submit("G1")
     (site.data_dir / ".fresh").rename(site.data_dir / ".away")
     for _ in range(3):
@@ -210,11 +238,63 @@ def test_a_job_waits_for_a_disk_that_is_away(site: Site, monkeypatch: pytest.Mon
     assert Bench(site).run(job_id).state is JobState.DONE
 
 
+@pytest.mark.parametrize("again", [False, True])
+def test_a_disk_that_fails_once_fails_no_job(site: Site, again: bool):
+    """As a memory card does, or a disk that is pulled."""
+
+    def breaks(task: Any, progress: Any) -> dict[str, Any]:
+        if task.attempt == 1 or again:
+            raise OSError(errno.EROFS, "Read-only file system", str(task.target))
+        return light(task, progress)
+
+    job = Bench(site).run(site.submit("G1"), breaks)
+    assert (job.state, job.losses) == (JobState.QUEUED, 1)
+    job = Bench(site).run(job.id, breaks)
+    assert job.state is (JobState.FAILED if again else JobState.DONE)
+    if again:
+        assert (job.problem["status"], job.problem["title"]) == (503, "Storage unavailable")
+        assert "Read-only file system" in job.problem["detail"]
+
+
 def test_a_job_without_room_waits_in_the_queue(site: Site):
     broken = _Broken(site.storage, StorageError(28, "No space left", "/"), 1)
     job = Bench(site).run(site.submit("G1"), storage=broken)
     assert (job.state, job.stage, job.losses) == (JobState.QUEUED, WAITING_FOR_ROOM, 0)
     assert Bench(site).run(job.id).state is JobState.DONE
+    site.check_files()
+
+
+def test_what_a_quota_has_no_room_for_is_not_computed_again_in_vain(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+):
+    """The disk has room: of a quota only asking for it tells."""
+    quota_bytes = computed = 0
+
+    def reserves(_: int, __: int, more_bytes: int) -> None:
+        if more_bytes > quota_bytes:
+            raise OSError(errno.EDQUOT, "Disk quota exceeded")
+
+    def writes(task: Any, progress: Any) -> dict[str, Any]:
+        nonlocal computed
+        computed += 1
+        task.target.write_bytes(bytes(_RESULT_BYTES))
+        if quota_bytes < _RESULT_BYTES:
+            raise OSError(errno.EDQUOT, "Disk quota exceeded")
+        return light(task, progress)
+
+    monkeypatch.setattr("stillpath.service.storage.disk.os.posix_fallocate", reserves)
+    monkeypatch.setattr("stillpath.service.jobs.room._NO_ROOM_S", 0.0)
+    look = RoomForJobs(Disk(site.data_dir, 0), site.storage, is_own_disk=True)
+    job_id = site.submit("G1")
+    for _ in range(3):
+        job = Bench(site).run(job_id, writes)  # as where workers have disks of their own
+        assert (job.state, job.stage) == (JobState.QUEUED, WAITING_FOR_ROOM)
+        assert not any(look.for_retry(job, time.monotonic()) for _ in range(3))
+    assert computed == 1
+    assert (job.room_bytes or 0) >= _RESULT_BYTES
+    quota_bytes = 64 * _RESULT_BYTES
+    assert look.for_retry(job, time.monotonic())
+    assert Bench(site).run(job_id, writes).state is JobState.DONE
     site.check_files()
 
 

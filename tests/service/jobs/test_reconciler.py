@@ -102,6 +102,27 @@ def test_a_service_that_was_killed_is_no_loss_of_its_jobs(site: Site, own: bool,
     assert (job.state, job.losses) == (JobState.QUEUED, int(ours or not own))
 
 
+@pytest.mark.parametrize("own_database", [True, False])
+def test_a_job_that_freezes_the_computer_is_not_begun_for_ever(site: Site, own_database: bool):
+    """Somebody switches it off and on again; the job would freeze it as soon as it is on."""
+    job_id = site.submit("G1")
+    ends = 0
+    while site.get(job_id).state is JobState.QUEUED:
+        began = time.time() if own_database else time.time() - 3600.0
+        site.store.apply(job_id, Claimed(began, "w"))
+        ends += 1
+        look = looking(site, Workers())
+        look._took_over = not own_database  # PostgreSQL tells of it by silence
+        look._steady._since_s -= 3600.0
+        look._tick()
+        site.store.release("reconciler", look._holder, time.time())
+        assert ends < 9
+    job = site.get(job_id)
+    assert (job.state, ends) == (JobState.FAILED, 4)
+    assert job.problem is not None
+    assert "the computer went down while the job was under way" in job.problem["detail"]
+
+
 def test_a_disk_that_held_everybody_up_is_no_silence(site: Site, monkeypatch: pytest.MonkeyPatch):
     """A worker's heartbeat waits for the disk as the reconciler does, and may come after it."""
     look = looking(site, Workers())
@@ -137,7 +158,8 @@ def test_a_print_is_not_started_days_after_it_was_expected(
     created_at = now - submitted_h * 3600
     job_id = site.submit("G1", printer="left", print_after=True, created_at=created_at)
     look._tick()
-    assert site.get(job_id).print_after == (min(away_h, submitted_h) < 1.0)
+    job = site.get(job_id)
+    assert (job.print_after, job.held_back) == (True, min(away_h, submitted_h) > 1.0)
 
 
 @pytest.mark.parametrize("slept", [False, True])
@@ -170,8 +192,78 @@ def test_a_clock_that_is_put_right_keeps_no_print_from_starting(
     clock.ahead_s = 8 * 3600.0
     look._leased_at -= 3.0
     look._tick()
-    assert not site.get(yesterdays).print_after
-    assert site.get(todays).print_after != slept
+    assert site.get(yesterdays).held_back
+    assert site.get(todays).held_back == slept
+
+
+def test_a_print_from_before_the_clock_was_set_back_is_not_started(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+):
+    """A board without a battery begins in 1970; for how long it was off nobody knows."""
+
+    @dataclass
+    class Clock:
+        CLOCK_BOOTTIME: int = 7
+
+        def time(self) -> float:
+            return 100.0
+
+        def monotonic(self) -> float:
+            return time.monotonic()
+
+        def clock_gettime(self, _: int) -> float:
+            return time.monotonic()
+
+    site.store.lease("reconciler", "before the power cut", 5.0, time.time())
+    before = site.submit("G1", printer="left", print_after=True)
+    monkeypatch.setattr(reconciler, "time", Clock())
+    look = looking(site, Workers())
+    since = site.submit("G1 X", printer="left", print_after=True, created_at=100.0)
+    look._tick()
+    assert site.get(before).held_back
+    assert not site.get(since).held_back
+
+
+@pytest.mark.parametrize("lacking", ["workers", "room"])
+@pytest.mark.parametrize("hours", [0.5, 72.0])
+def test_a_print_for_which_nothing_could_be_done_for_days_is_not_started(
+    site: Site, monkeypatch: pytest.MonkeyPatch, lacking: str, hours: float
+):
+    """The service ran, but its workers were away, or the disk was full."""
+    workers = Workers()
+    look = looking(site, workers)
+    look._tick()
+    days = 0.0
+    monkeypatch.setattr(reconciler, "_since_boot_s", lambda: since + days)
+    since = look._able_at
+    with monkeypatch.context() as trouble:
+        if lacking == "workers":
+            trouble.setattr(workers, "slots", lambda: 0)
+        else:
+            trouble.setattr(look._room, "for_any", lambda: False)
+        look._tick()
+        created_at = time.time() - 3600.0 * hours
+        old = site.submit("G1", printer="left", print_after=True, created_at=created_at)
+        new = site.submit("G1 X", printer="left", print_after=True)
+        days = 3600.0 * hours
+        look._tick()
+    look._tick()
+    assert site.get(old).held_back == (hours > 1.0)
+    assert not site.get(new).held_back
+
+
+def test_who_takes_over_the_work_starts_prints(site: Site, monkeypatch: pytest.MonkeyPatch):
+    """It was ready for days, while another service did the jobs."""
+    site.store.lease("reconciler", "another", 5.0, time.time())
+    look = looking(site, Workers())
+    look._tick()
+    since = look._able_at
+    monkeypatch.setattr(reconciler, "_since_boot_s", lambda: since + 72 * 3600.0)
+    site.store.release("reconciler", "another", time.time())
+    created_at = time.time() - 5000.0
+    job_id = site.submit("G1", printer="left", print_after=True, created_at=created_at)
+    look._tick()
+    assert not site.get(job_id).held_back
 
 
 def test_a_database_that_takes_no_writes_is_trouble_that_lasts(

@@ -6,6 +6,7 @@ import errno
 import os
 import time
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -176,3 +177,29 @@ def test_files_that_are_seen_without_a_row_for_long_go(site: Site, sweep: Sweep,
     (folder / "grows").write_text("xx")
     clock.sweep(sweep, 23)
     assert [file.name for file in folder.iterdir()] == ["grows"]
+
+
+def test_two_services_in_one_storage_delete_nothing_of_each_other(tmp_path: Path, clock: Clock):
+    """Each with a database of its own: neither knows the jobs of the other."""
+    storage_url = (tmp_path / "nas").as_uri()
+    sites = [Site(tmp_path / name, storage_url=storage_url) for name in ("a", "b")]
+    sweeps = [Sweep(site.settings, site.store, site.storage, clock=clock) for site in sites]
+    jobs = [site.submit("G1") for site in sites]
+    put(sites[0], "jobs/nobody/source/a")
+    for _ in range(2):
+        for sweep in sweeps:
+            sweep.run()
+        clock.now_s += 2 * 3600.0
+    kept = {f"jobs/{job_id}/source/part.gcode" for job_id in jobs}
+    assert keys(sites[0]) == {*kept, "jobs/nobody/source/a"}
+    [other] = [
+        stat.key
+        for stat in sites[1].storage.list("databases/")
+        if not stat.key.endswith(sites[0].store.identity())
+    ]
+    assert sites[1].store.forget(jobs[1])  # and its service is gone, with its mark
+    (tmp_path / "nas" / other).unlink()
+    clock.sweep(sweeps[0], 2.1)
+    assert keys(sites[0]) == {f"jobs/{jobs[0]}/source/part.gcode"}
+    for site in sites:
+        site.close()
