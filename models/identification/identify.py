@@ -252,7 +252,7 @@ class _AxisWork:
                 found = self._from_model()
             case "spectrum":
                 assert self._explained is not None
-                found = self._from_spectra(self._explained, frame_likely)
+                found = self._from_tables(self._explained, frame_likely)
             case "raw log":
                 found = self._from_logs(frame_likely)
             case _:
@@ -423,17 +423,17 @@ class _AxisWork:
         )
         return _Explained(runs, common, by)
 
+    def _from_tables(self, explained: _Explained, frame_likely: float) -> AxisIdentification:
+        settings, spectra = self._settings, [run.spectrum for run in explained.runs]
+        notes = [(one.source, note) for one in spectra for note in excitation_notes(one, settings)]
+        if not settings.sensor_axis:
+            notes += table_mounting_notes(self._axis, spectra, turned=settings.sensor_turned)
+        found = self._from_spectra(explained, frame_likely)
+        return replace(found, notes=(*by_file(notes), *found.notes))
+
     def _from_spectra(self, explained: _Explained, frame_likely: float) -> AxisIdentification:
         runs, common = explained.runs, explained.common
         settings, column = self._settings, self._settings.sensor_axis
-        notes = [
-            (run.spectrum.source, note)
-            for run in runs
-            for note in excitation_notes(run.spectrum, settings)
-        ]
-        if not column:
-            spectra = [run.spectrum for run in runs]
-            notes += table_mounting_notes(self._axis, spectra, turned=settings.sensor_turned)
         found = spectrum_set(
             explained.by,
             axis=self._axis,
@@ -450,7 +450,7 @@ class _AxisWork:
             test = same_test(spectra, [run.test for run in under])
             fits[condition] = refit_spectrum(mean_spectrum(spectra), test, nominal, column=column)
         others = (run.spectrum for run in runs if run.condition not in common)
-        found = replace(found, measured=(*found.measured, *others), notes=tuple(by_file(notes)))
+        found = replace(found, measured=(*found.measured, *others))
         return scheduled(found, nominal, fits, "spectrum")
 
     def _from_magnitudes(
@@ -462,10 +462,15 @@ class _AxisWork:
         spectra, left_out = of_one_test(spectra, self._axis)
         found = self._from_spectra(self._explain(spectra), frame_likely)
         read = [note for run in logs for note in run.log.notes]
+        # What is known of the tests is what the logs say: spectra say less.
+        tests = by_file((run.log.source, note) for run in logs for note in run.response.notes)
+        turned = mounting_notes(self._axis, [run.response for run in logs])
+        mounting = [] if self._settings.sensor_axis else turned
+        about = (*tests, *mounting, *body_notes(friction.held_mm, None), *left_out)
         return replace(
             found,
             plants=_rubbing(found.plants, friction),
-            notes=(*found.notes, *body_notes(friction.held_mm, None), *left_out),
+            notes=(*found.notes, *about),
             warnings=(*found.warnings, phase_warning(self._axis, fault, read)),
         )
 
