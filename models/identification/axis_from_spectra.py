@@ -19,6 +19,7 @@ from stillpath.models.identification.conditions import Condition
 from stillpath.models.identification.friction import Friction
 from stillpath.models.identification.messages import (
     body_notes,
+    mounting_notes,
     phase_warning,
     table_mounting_notes,
 )
@@ -141,9 +142,11 @@ def from_magnitudes(
     spectra, left_out = of_one_test([spectrum_in(run, column) for run in logs], task.axis)
     found = from_spectra(task, explain(task, spectra), frame_likely)
     read = [note for run in logs for note in run.log.notes]
+    turned = mounting_notes(task.axis, [run.response for run in logs])
+    mounting = [] if task.settings.sensor_axis else turned
     return replace(
         found,
         plants=friction.on(found.plants),
-        notes=(*found.notes, *body_notes(friction.held_mm, None), *left_out),
+        notes=(*found.notes, *mounting, *body_notes(friction.held_mm, None), *left_out),
         warnings=(*found.warnings, phase_warning(task.axis, fault, read)),
     )

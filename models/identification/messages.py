@@ -31,6 +31,7 @@ __all__ = [
     "apart_warning",
     "body_notes",
     "cross_axis_warning",
+    "drowned_warning",
     "fit_warnings",
     "frame_mode_warnings",
     "friction_notes",
@@ -388,6 +389,20 @@ def apart_warning(spectra: Sequence[Spectrum], logs: Array) -> tuple[str, ...]:
             "mounting); give only tables of the machine as it prints today"
         ),
     )
+
+
+def drowned_warning(spectrum: Spectrum, column: str) -> tuple[str, ...]:
+    """Warn where another of the sensor's axes shows more at the beginning of the test."""
+    most, share = moved_most(spectrum)
+    if most in ("", column) or share > _MOSTLY or column not in "xyz":
+        return ()
+    text = (
+        f"{spectrum.source}: at low frequency, where the test is weakest, the sensor's {most} "
+        f"shows more than its {column}, which moved most in the whole test and is used: noise as "
+        "strong as the test. Damping and level may be off: shield the sensor's cable, or lower the "
+        "rate of its bus, and measure again"
+    )
+    return (text,)
 
 
 def cross_axis_warning(share: float, other: str, column: str) -> tuple[str, ...]:

@@ -142,8 +142,8 @@ def spectrum_in(run: RawRun, column: str) -> SpectrumRun:
     told = f_hz <= _TABLE_HZ
     psd_of = {column: psd[told]}
     spectrum = Spectrum(f_hz[told], psd_of, run.log.axis, run.log.source, strength)
-    notes = (*run.assumed.notes, *aligned.notes)
-    return SpectrumRun(spectrum, test, run.condition, notes)
+    # What is known of the test is what the log says: a spectrum of it says less.
+    return SpectrumRun(spectrum, test, run.condition, run.response.notes)
 
 
 def lateness_in(

@@ -28,6 +28,7 @@ from stillpath.models.identification.frame import (
 from stillpath.models.identification.messages import (
     apart_warning,
     cross_axis_warning,
+    drowned_warning,
     frame_mode_warnings,
     spectrum_level_warning,
 )
@@ -141,6 +142,7 @@ class Explanations:
         return (
             *spectrum_level_warning(gain, self.excitation, names),
             *cross_axis_warning(*cross, self.column),
+            *(text for one in self.spectra for text in drowned_warning(one, self.column)),
             *apart_warning(self.spectra, self.search.repeats),
         )
 

@@ -12,6 +12,7 @@ import pytest
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.estimation import estimate_driven
 from stillpath.models.identification.fitting import fit_response, refit_response
+from stillpath.models.identification.response_data import response_data
 from stillpath.models.identification.types import DrivenLog, FrequencyResponse
 from stillpath.models.plants import frequency_response
 from stillpath.models.store import load_machine
@@ -126,6 +127,19 @@ def test_points_coherent_by_chance_do_not_widen_the_band() -> None:
     fit = fit_response(replace(clean, response=noisy, coherence=coherence))
     assert fit.band_hz == (5.0, 79.5)
     assert fit.residual < 0.005
+
+
+@pytest.mark.parametrize(("coherence", "is_fitted"), [(0.9, True), (0.7, False)])
+def test_a_resonance_of_less_coherence_is_fitted(coherence: float, is_fitted: bool) -> None:
+    """Guides that rub cost coherence at the peak first; elsewhere such points are left out."""
+    clean = measured(modal(TRUTH, (1.1, -0.15, 0.05)))
+    beside = (clean.f_hz > 105.0) & (clean.f_hz < 115.0)
+    at_peak = np.abs(clean.f_hz - 47.0) < 4.0
+    less_beside = replace(clean, coherence=np.where(beside, coherence, 0.999))
+    assert not np.isin(clean.f_hz[beside], response_data(less_beside).f_hz).any()
+    data = response_data(replace(clean, coherence=np.where(at_peak, coherence, 0.999)))
+    assert np.isin(clean.f_hz[at_peak], data.f_hz).all() == is_fitted
+    assert bool(data.warnings) != is_fitted
 
 
 def test_noise_only_in_incoherent_points_is_left_out() -> None:

@@ -20,6 +20,7 @@ from stillpath.models.identification.conditions import Condition
 from stillpath.models.identification.identify import Measured, identify
 from stillpath.models.identification.messages import (
     mounting_notes,
+    phase_fault,
     phase_warning,
     spectrum_level_warning,
 )
@@ -43,6 +44,7 @@ from stillpath.models.identification.types import (
 from stillpath.models.notes import WarningNote
 from stillpath.models.plants import (
     PairsSpec,
+    PlantSetSpec,
     PolePair,
     RelativeMode,
     RelativeModesSpec,
@@ -803,11 +805,14 @@ def test_logs_whose_phase_no_model_explains_count_as_tables(share: float) -> Non
     test = replace(QUICK, f_end_hz=90.0)
     settings = ReadSettings.model_validate({**QUICK_SETTINGS, "f_end_hz": 90.0})
     log = late_by_less(quick_log(plant=plant, test=test), plant, share)
-    found = one(raw_file(log), settings=settings)
+    turned = replace(log, accel_mm_s2=log.accel_mm_s2[:, [2, 1, 0]])
+    found = one(raw_file(turned), settings=settings)
     about = found.plants.provenance
     assert about is not None
     assert about.magnitude_only
     assert any("only the size of the vibrations" in text for text in found.warnings)
+    # What the log says of its test and its sensor is said, not what a spectrum of it would.
+    assert any("the sensor's z moved in the test of axis x" in note for note in found.notes)
     assert found.plants.friction_assumed is any("mass is assumed" in note for note in found.notes)
     assert found.plants.friction_assumed is not any("dry friction holds" in n for n in found.notes)
     assert main_mode(found) == pytest.approx(42.0, rel=0.05)
@@ -852,7 +857,7 @@ def staggering(log: AccelerationLog, from_hz: float) -> AccelerationLog:
 
 
 @pytest.mark.slow
-def test_logs_that_follow_up_to_below_the_resonance_count_as_tables() -> None:
+def test_logs_that_hardly_follow_at_the_resonance_count_as_tables() -> None:
     """Guides that rub much; such logs were refused, with the advice to measure what they are."""
     test = replace(QUICK, f_end_hz=90.0)
     settings = ReadSettings.model_validate({**QUICK_SETTINGS, "f_end_hz": 90.0})
@@ -862,7 +867,21 @@ def test_logs_that_follow_up_to_below_the_resonance_count_as_tables() -> None:
     assert about.magnitude_only
     assert found.fit is not None
     assert max(found.fit.modes, key=lambda m: m.peak).f_hz == pytest.approx(42.0, rel=0.1)
-    assert any("the axis follows its command up to" in text for text in found.warnings)
+    assert any("only the size of the vibrations" in text for text in found.warnings)
+
+
+@pytest.mark.parametrize(("rings_hz", "told"), [(42.0, True), (35.0, False)])
+def test_the_phase_of_logs_that_follow_up_to_below_the_resonance_is_not_used(
+    rings_hz: float, *, told: bool
+) -> None:
+    rings = ModeEstimate(f_hz=rings_hz, zeta=0.06, f_sd_hz=0.1, zeta_sd=0.01, peak=8.0)
+    plant = one_mode(rings_hz, 0.06)
+    fit = Fit(plant, 0.02, 1.0, 0.0, (6.0, 37.0), (rings,))
+    plants = PlantSetSpec(nominal=plant)
+    found = AxisIdentification(axis="x", plants=plants, fit=fit, measured=(response(plant),))
+    fault = phase_fault(found)
+    assert (fault is not None) == told
+    assert not told or "follows its command up to 37.0 Hz only" in str(fault)
 
 
 def test_logs_that_hardly_follow_are_refused_and_friction_is_named() -> None:

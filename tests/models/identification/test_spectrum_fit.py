@@ -200,6 +200,21 @@ def test_interpolated_tables_count_by_bin() -> None:
     assert np.diff(thinned.f_hz) == pytest.approx(1.6)
 
 
+def test_column_of_a_sensor_that_garbles_samples() -> None:
+    """Its y hissed more than the test began with, so models were made of noise (a Trident)."""
+    clean = simulated(NARROW, (0.7, 0.3), LEGACY)
+    noise = {"x": 4e3, "y": 2e4, "z": 1e4}
+    garbled = replace(clean, psd={n: clean.psd[n] + noise[n] for n in noise}, source="x.csv")
+    low = (clean.f_hz >= 8.0) & (clean.f_hz <= 15.0)
+    assert garbled.psd["y"][low].sum() > garbled.psd["x"][low].sum()
+    found = explanations([garbled], LEGACY, max_order=1)
+    assert found.column == "x"
+    warnings = found.explained().fit.warnings
+    assert any(w.startswith("x.csv: at low frequency") and "shield" in w for w in warnings)
+    of_clean = explanations([clean], LEGACY, max_order=1).explained().fit.warnings
+    assert not any("at low frequency" in warning for warning in of_clean)
+
+
 @pytest.mark.slow
 def test_column_that_follows_the_drive() -> None:
     spectrum = simulated(NARROW, (0.7, 0.3), LEGACY)
@@ -215,7 +230,7 @@ def test_column_of_a_test_that_begins_above_15_hz() -> None:
     """Below its start the axis of the sensor that hisses most was taken to follow it."""
     test = replace(LEGACY, f_start_hz=20.0)
     spectrum = simulated(NARROW, (0.7, 0.3), test)
-    z = np.where(spectrum.f_hz < 18.0, 2.0 * spectrum.psd["x"], spectrum.psd["y"])
+    z = np.where(spectrum.f_hz < 18.0, 10.0 * spectrum.psd["x"], spectrum.psd["y"])
     hissing = replace(spectrum, psd={**spectrum.psd, "z": z})
     assert driven_column(hissing) == "z"
     assert driven_column(hissing, test.f_start_hz) == "x"
