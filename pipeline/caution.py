@@ -46,6 +46,7 @@ __all__ = [
     "caution_for",
     "choose_caution",
     "design_mode",
+    "has_measured_set",
     "measured_set",
     "most_share",
     "set_or_nominal",
@@ -110,12 +111,17 @@ def measured_set(axis: PlantSetSpec) -> bool:
     return members and stated_hz(axis) is None
 
 
+def has_measured_set(machine: Machine) -> bool:
+    """Return whether an axis of a machine has a set of several plants from a measurement."""
+    return any(map(measured_set, machine.axes.values()))
+
+
 def design_mode(machine: Machine, *, budget: bool = False) -> str:
     """Return the robust mode of `compensation.fbf.PreviewFbf` that `robust=auto` tries first.
 
     A speed budget limits the error of the worst plant, so with one that plant counts more.
     """
-    if not any(map(measured_set, machine.axes.values())):
+    if not has_measured_set(machine):
         return "off"
     return "minimax" if budget else "ensemble"
 
@@ -139,7 +145,7 @@ def caution_for(
     """Return the mixture for `robust=auto` and the reason; None where no shaper is mixed in."""
     if options.vibration != "fbf" or options.robust != "auto":
         return None
-    measured = any(map(measured_set, machine.axes.values()))
+    measured = has_measured_set(machine)
     # A schedule of the resonance means that more is known than its typed-in frequency.
     stated = not machine.schedules and any(map(stated_hz, machine.axes.values()))
     if not measured and not stated:

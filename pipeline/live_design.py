@@ -27,13 +27,11 @@ from stillpath.pipeline.caution import (
     Mixtures,
     Shares,
     best_shares,
-    measured_set,
     most_share,
 )
 from stillpath.pipeline.error_range import ErrorRange, error_ranges
 from stillpath.pipeline.files import kept
 from stillpath.pipeline.measuring.reference_shaper import BestShaper, cached_shaper
-from stillpath.pipeline.result import Channel
 
 __all__ = ["LiveDesign", "cached_live_design", "design_live", "live_filter"]
 
@@ -61,7 +59,7 @@ class LiveDesign:
     worst, mean : float
         Largest and geometric mean over the members of the contour error against the shaper's.
     ranges : dict of str to ErrorRange
-        By channel: before, live, shaper.
+        On the reference motion, by channel: before, live, shaper.
     peak_accel_mm_s2 : float
         Of an axis of the command on the reference motion.
     """
@@ -78,19 +76,6 @@ class LiveDesign:
     def accel_gain(self, axis: int) -> float:
         """Return the largest ratio of the command's acceleration to the plan's: sum |taps|."""
         return float(np.abs(self.taps[axis]).sum())
-
-    def ranged(self, channel: Channel, machine: Machine) -> Channel:
-        """Return the measured figures of a file, with their range over the machine's set.
-
-        Parameters
-        ----------
-        channel : Channel
-            Named `before`, `after` (which is live) or `shaper`.
-        """
-        if not any(map(measured_set, machine.axes.values())):
-            return channel
-        name = "live" if channel.name == "after" else channel.name
-        return self.ranges[name].applied_to(channel)
 
 
 def live_filter(machine: Machine, taps: Array) -> LiveFilter:

@@ -12,6 +12,7 @@ from pathlib import Path
 from stillpath.compensation.base import DesignError
 from stillpath.gcode.errors import GcodeError
 from stillpath.models.machine import Machine
+from stillpath.pipeline.caution import has_measured_set
 from stillpath.pipeline.clock import StageClock
 from stillpath.pipeline.file_motion import STANDING_S, FileMotion
 from stillpath.pipeline.files import check_unchanged, default_cache_dir, replacing
@@ -60,11 +61,10 @@ def simulate_live(
     motion = _sliced_motion(source, plate, machine, dialect, progress)
     live = live_filter(machine, design.taps)
     result = simulate_motion(motion, cache_dir=cache_dir, layers=layers, trace=trace, live=live)
-    channels = [design.ranged(channel, machine) for channel in result.channels]
-    (after,) = (channel for channel in channels if channel.name == "after")
+    (after,) = (channel for channel in result.channels if channel.name == "after")
     way = live_way(after, result.original_time_s, result.original_bytes)
     stages = [StageTime(stage="design", cpu_s=round(clock.cpu_s["design"], 4)), *result.stages]
-    return result.model_copy(update={"channels": channels, "ways": [way], "stages": stages})
+    return result.model_copy(update={"ways": [way], "stages": stages})
 
 
 def keep_file(source: Path, target: Path, began: os.stat_result) -> None:
@@ -159,8 +159,10 @@ def _way(
     live = LiveMotion(live_filter(machine, design.taps))
     measured(motion, live, measurement, Operation(machine), StageClock())
     measurement.finish()
-    (channel,) = measurement.channels()
-    return live_way(design.ranged(channel, machine), motion.time_s, size)
+    channels = measurement.channels()
+    if has_measured_set(machine):
+        channels = measurement.sample.ranged(channels, machine, design.shaper)
+    return live_way(channels[0], motion.time_s, size)
 
 
 def _sliced_motion(

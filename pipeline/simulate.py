@@ -15,6 +15,7 @@ from stillpath.gcode.firmware.signatures import signed_at
 from stillpath.models.machine import Machine
 from stillpath.models.schedule import OperatingPoint
 from stillpath.models.shaping import OFF
+from stillpath.pipeline.caution import has_measured_set
 from stillpath.pipeline.clock import StageClock
 from stillpath.pipeline.columns import npz_table
 from stillpath.pipeline.file_motion import STANDING_S, FileMotion
@@ -149,12 +150,11 @@ def simulate_motion(
     operation = Operation(machine)
     names = UNCHANGED_CHANNELS if live is None else CHANNELS
     began = motion.source.stat()
-    size = began.st_size
     with contextlib.ExitStack() as files:
         writer = None if layers is None else files.enter_context(written_layers(layers, names))
         take_layer = writer.add if writer else None
         measurement = Measurement(
-            machine, DT_S, shaper, names, take_layer=take_layer, trace=trace, size=size
+            machine, DT_S, shaper, names, take_layer=take_layer, trace=trace, size=began.st_size
         )
         stream = ShapedMotion(DT_S) if live is None else LiveMotion(live)
         seen = measured(motion, stream, measurement, operation, clock)
@@ -162,8 +162,11 @@ def simulate_motion(
         check_unchanged(motion.source, began)
         if writer is not None:
             writer.finish(motion.feature_names)
+    channels = measurement.channels("printed live")
+    if live is not None and has_measured_set(machine):
+        channels = measurement.sample.ranged(channels, machine, shaper)
     notes = [*operation.notes(), *motion.notes]
-    if any(label != OFF.label for label in motion.shapers):
+    if set(motion.shapers) - {OFF.label}:
         notes.append(f"The file sets the firmware's shaper: {', '.join(motion.shapers)}.")
     return Result(
         version=__version__,
@@ -172,14 +175,14 @@ def simulate_motion(
         machine_revision=machine.revision,
         settings={"method": "simulate" if live is None else "live"},
         source_name=motion.source.name,
-        channels=measurement.channels("printed live"),
+        channels=channels,
         best_shaper=shaper.label,
         original_time_s=motion.time_s,
         time_s=motion.time_s,
         slicer=motion.facts.slicer,
         slicer_time_s=motion.facts.estimate_s,
-        original_bytes=size,
-        written_bytes=size,
+        original_bytes=began.st_size,
+        written_bytes=began.st_size,
         peak_accel_mm_s2=0.0,
         peak_velocity_mm_s=seen.peak_velocity_mm_s,
         extruding_s=seen.extruding_s,

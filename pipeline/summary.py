@@ -101,8 +101,7 @@ class Summary:
                 c.model_copy(update={"selected_rms_um": rms_um.get(c.name)}) for c in channels
             ]
         if self.choice is not None:
-            ranges = self.measurement.sample.ranges(self.machine, self.shaper)
-            channels = [ranges[c.name].applied_to(c) if c.name in ranges else c for c in channels]
+            channels = self.measurement.sample.ranged(channels, self.machine, self.shaper)
         return channels
 
     def _warnings(self, channels: list[Channel], facts: SlicerFacts) -> Iterator[str]:

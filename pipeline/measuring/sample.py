@@ -14,6 +14,7 @@ from stillpath.models.machine import Machine
 from stillpath.pipeline.error_range import ErrorRange, error_ranges
 from stillpath.pipeline.measuring.points import MotionSamples
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
+from stillpath.pipeline.result import Channel
 from stillpath.simulation.measures import PathDistances
 
 __all__ = ["MotionSample"]
@@ -61,6 +62,13 @@ class MotionSample:
                 if len(self._kept) > _MOST:
                     self._kept, self._every = self._kept[::2], 2 * self._every
             self._seen += 1
+
+    def ranged(
+        self, channels: Sequence[Channel], machine: Machine, shaper: BestShaper
+    ) -> list[Channel]:
+        """Return the measured figures of a print with their ranges (`ranges`)."""
+        ranges = self.ranges(machine, shaper)
+        return [ranges[c.name].applied_to(c) if c.name in ranges else c for c in channels]
 
     def ranges(self, machine: Machine, shaper: BestShaper) -> dict[str, ErrorRange]:
         """Return the ranges of the errors by channel; none if nothing was printed.
