@@ -27,6 +27,8 @@ _LEAD_S, _CUT_S = 0.6, 0.1
 and a shaper looks ahead."""
 _RUN_UP_S = 0.1
 """How long the motion in front of a stretch takes from a standstill to its first velocity."""
+_STANDS_MM = 0.02
+"""First step of a short piece that begins at a standstill: it does without the lead."""
 _LEAST_EXTRUDING = 0.1
 """Share of a stretch; others say nothing about what prints."""
 _STRIDE = 5
@@ -50,12 +52,14 @@ class MotionSample:
     def add(self, samples: MotionSamples) -> None:
         """Add the motion of a piece."""
         length, lead, cut = (round(each / self._dt_s) for each in (_STRETCH_S, _LEAD_S, _CUT_S))
-        for start in range(0, max(len(samples) - lead - cut, 0), length):
+        if len(samples) < length and np.all(np.abs(np.diff(samples.path_mm[:, :2])) < _STANDS_MM):
+            lead = 0
+        for start in range(0, max(len(samples) - cut, 0), length):
             stop = min(start + length, len(samples))
             measured = samples.extruding[start : stop - cut].copy()
             measured[:lead] = False
             at = np.flatnonzero(measured).astype(np.int64)[::_STRIDE]
-            if _STRIDE * len(at) <= _LEAST_EXTRUDING * length:
+            if _STRIDE * len(at) <= _LEAST_EXTRUDING * (stop - start):
                 continue
             if self._seen % self._every == 0:
                 self._kept.append(_Stretch.of(samples, start, stop, at, self._dt_s))

@@ -113,6 +113,17 @@ def test_a_long_print_is_sampled_along_its_whole_length() -> None:
     assert np.ptp(np.diff(places)) < 1e-6
 
 
+def test_pieces_of_half_a_second_count_from_their_standstill() -> None:
+    path, extruding = reference_motion(DT_S)
+    first = int(np.flatnonzero(extruding)[0])
+    shown = MotionSample(DT_S)
+    for _ in range(5):
+        part = slice(first, first + 500)
+        shown.add(motion(path[:, part], path[:, part], extruding[part]))
+    found = shown.ranges(machine(), SHAPER)["before"]
+    assert found.low < 1.0 < found.high
+
+
 def test_travels_alone_say_nothing() -> None:
     path = np.stack([0.1 * np.arange(20_000), np.zeros(20_000)])
     shown = MotionSample(DT_S)
