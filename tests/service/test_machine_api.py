@@ -275,11 +275,18 @@ def test_a_machine_of_a_printer_cfg(client: TestClient):
     machine = client.get(MINE).json()
     assert (machine["title"], machine["kinematics"]) == ("Mine", "corexy")
     assert machine["axes"]["x"]["nominal"]["modes"][0]["f_hz"] == 51
-    answer = settings(client, CONFIG, {"If-Match": made.headers["etag"]})
-    assert_problem(answer, 422, "give another name")
+    same = settings(client, CONFIG, {"If-Match": made.headers["etag"]})
+    assert (same.status_code, same.json()["number"]) == (200, 1)
     # What it includes does not come along: the history says what is unknown.
     unread = "; not read, so unknown: mainsail.cfg"
     assert made.json()["message"] == f"from printer.cfg{unread}"
+    later = CONFIG.replace("square_corner_velocity: ", "square_corner_velocity: 1")
+    again = settings(client, later, {"If-Match": made.headers["etag"]})
+    assert (again.status_code, again.json()["number"]) == (200, 2)
+    assert client.get(MINE).json()["axes"] == machine["axes"]
+    other = CONFIG.replace("corexy", "cartesian")
+    answer = settings(client, other, {"If-Match": again.headers["etag"]})
+    assert_problem(answer, 422, "was measured as corexy", "from-config")
 
 
 @pytest.mark.parametrize(
