@@ -65,7 +65,9 @@ def test_a_measurement_is_tried_then_kept(visitor: Visitor, service: Service, tm
     file = tmp_path / recording.name
     file.write_bytes(recording.content)
     page = visitor.open("#/machines/measured")
-    page.locator("input[type=file]").set_input_files(file)
+    page.locator("form", has_text="Choose measurements").locator(
+        "input[type=file]"
+    ).set_input_files(file)
     page.get_by_text("How the test was run").click()
     expect(page.get_by_text("only what lies between From and To is fitted")).to_be_visible()
     expect(page.get_by_label("To, Hz")).to_have_attribute("placeholder", "135 (133.3)")
@@ -160,7 +162,7 @@ def test_a_machine_is_made_of_what_marlin_answers(visitor: Visitor, tmp_path: Pa
     file.write_text(M503.replace("P510", "P900"))
     again = page.locator("form", has_text="M503")
     again.locator("input[type=file]").set_input_files(file)
-    page.get_by_role("button", name="Keep as the next revision").click()
+    page.get_by_role("button", name="Keep the settings as the next revision").click()
     expect(page.get_by_role("button", name="Show differences")).to_be_visible()
     visitor.shoot(page, "machine-of-m503")
 
@@ -180,6 +182,6 @@ def test_a_machine_is_brought_up_to_date_by_its_printer_cfg(visitor: Visitor, tm
     file.write_text(config.replace("3000", "5000"))
     again = page.locator("form", has_text="Choose printer.cfg")
     again.locator("input[type=file]").set_input_files(file)
-    page.get_by_role("button", name="Keep as the next revision").click()
+    page.get_by_role("button", name="Keep the settings as the next revision").click()
     expect(page.get_by_role("button", name="Show differences")).to_be_visible()
     visitor.shoot(page, "machine-of-config")

@@ -23,7 +23,7 @@ export function settingsPanel({ machine, firmware = "", signal }) {
   let text = "";
   let file = "";
   const status = h("div", { "aria-live": "polite" });
-  const keep = h("button.main", { type: "submit", disabled: true }, machine ? "Keep as the next revision" : "Make the machine");
+  const keep = h("button.main", { type: "submit", disabled: true }, machine ? "Keep the settings as the next revision" : "Make the machine");
   const name = h("input", { type: "text", id: "settings-name", required: true, ...NAME, autocomplete: "off", spellcheck: "false", "aria-describedby": "settings-name-hint" });
   const travel = h("input", { type: "text", id: "travel", pattern: TRAVEL, placeholder: "235x235x250", "aria-describedby": "travel-hint" });
   const kinematics = h("select", { id: "kinematics" }, [["cartesian", "Cartesian"], ["corexy", "CoreXY"]].map(([value, words]) => h("option", { value }, words)));
