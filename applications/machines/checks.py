@@ -21,6 +21,7 @@ __all__ = [
     "Difference",
     "StatedMachine",
     "age_warnings",
+    "changed_to",
     "check_before_job",
     "check_config",
     "derived_envelope",
@@ -381,7 +382,17 @@ def with_firmware(machine: Machine, section: dict[str, Any]) -> Machine:
     ValidationError
         If the section, or the machine with it, is invalid.
     """
-    document = {**machine.model_dump(mode="json"), "firmware": section}
+    return changed_to(machine, {**machine.model_dump(mode="json"), "firmware": section})
+
+
+def changed_to(machine: Machine, document: dict[str, Any]) -> Machine:
+    """Return a machine as its changed document has it; limits of the motors as `with_firmware`.
+
+    Raises
+    ------
+    ValidationError
+        If the document is invalid.
+    """
     derived = machine.command == derived_envelope(machine)
     if derived:
         del document["command"]

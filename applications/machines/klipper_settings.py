@@ -7,8 +7,8 @@ from typing import Any
 from pydantic import ValidationError
 
 from stillpath.applications.machines.checks import (
+    changed_to,
     check_config,
-    derived_envelope,
     not_followed,
     not_planned,
     put_fact,
@@ -54,14 +54,10 @@ def with_config(machine: Machine, config: PrinterConfig) -> Machine:
     whole = not config.includes
     document["firmware"]["macros_known"] = whole
     document["firmware"]["no_input_shaper"] = whole and "input_shaper" not in config.sections
-    derived = machine.command == derived_envelope(machine)
-    if derived:
-        del document["command"]
     try:
-        changed = Machine.model_validate(document)
+        return changed_to(machine, document)
     except ValidationError as error:
         raise ModelError(f"{config.name}: {explain(error)}") from None
-    return changed.model_copy(update={"command": derived_envelope(changed)}) if derived else changed
 
 
 def config_notes(config: PrinterConfig) -> list[str]:

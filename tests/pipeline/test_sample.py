@@ -85,19 +85,22 @@ def test_the_range_is_that_of_the_plants_on_the_print_itself() -> None:
     assert ranges["shaper"].reference_um < 0.5 * ranges["before"].reference_um
 
 
-def test_a_stretch_in_the_middle_of_a_line_shakes_nothing() -> None:
-    """A line at constant speed leaves no error, wherever it is cut."""
+def test_a_stretch_in_the_middle_of_a_line_shakes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A diagonal at constant speed leaves no error, wherever it is cut, though the axes differ."""
+    axes = {"x": PlantSetSpec(nominal=plant(42.0)), "y": PlantSetSpec(nominal=plant(55.0))}
+    unlike = machine().model_copy(update={"axes": axes})
     n = 60_000
-    path = np.stack([0.1 * np.arange(n), np.zeros(n)])
-    shown = MotionSample(DT_S)
-    shown.add(motion(path, path, np.ones(n, bool)))
-    ranges = shown.ranges(machine(), SHAPER)
-    # Contour errors across a straight line are 0 anyhow: so X lags behind Y, which stands, by none.
-    bent = np.stack([path[0], path[0]])
-    shown = MotionSample(DT_S)
-    shown.add(motion(bent, bent, np.ones(n, bool)))
-    assert ranges["before"].reference_um < 1e-3
-    assert shown.ranges(machine(), SHAPER)["before"].reference_um < 1e-3
+    path = np.stack([0.1 * np.arange(n), 0.1 * np.arange(n)])
+
+    def error_um() -> float:
+        shown = MotionSample(DT_S)
+        shown.add(motion(path, path, np.ones(n, bool)))
+        return shown.ranges(unlike, SHAPER)["before"].reference_um
+
+    assert error_um() < 0.01
+    monkeypatch.setattr(sample, "_LEAD_S", 0.0)
+    monkeypatch.setattr(sample, "_from_a_standstill", lambda motion_mm, dt_s: motion_mm.copy())
+    assert error_um() > 1.0
 
 
 def test_a_long_print_is_sampled_along_its_whole_length() -> None:
