@@ -33,7 +33,7 @@ from inputs import find_input, one_thread_each, plain_copy, shared_folder
 from readback import DT_S, WINDOW_S, Aligned, Motion, Own, Shaped, Timed, forced_stops, read_motion
 from scipy.signal import ss2zpk
 
-from stillpath.applications.machines.checks import derived_envelope
+from stillpath.applications.machines.envelope import derived_envelope
 from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
 from stillpath.models.firmware.klipper import Klipper

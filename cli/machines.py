@@ -17,8 +17,8 @@ from stillpath.cli.own_machines import By, Message, Name, open_machines, print_r
 from stillpath.models.errors import ModelError
 
 if TYPE_CHECKING:
-    from stillpath.applications.machines.checks import StatedMachine
     from stillpath.applications.machines.revision import Revision
+    from stillpath.applications.machines.stated import StatedMachine
     from stillpath.models.machine import Machine
 
 __all__ = ["app"]
@@ -311,15 +311,14 @@ def check(
     ] = None,
 ) -> None:
     """Look whether a machine can still be relied on. Exit code 0 fine, 2 not."""
-    from stillpath.applications.machines.checks import (
-        check_before_job,
-        differences,
-        envelope_warnings,
+    from stillpath.applications.machines.checks import check_before_job, differences
+    from stillpath.applications.machines.envelope import envelope_warnings
+    from stillpath.applications.machines.klipper_config import read_printer_config
+    from stillpath.applications.machines.klipper_settings import (
         not_followed,
         not_planned,
         read_as_older,
     )
-    from stillpath.applications.machines.klipper_config import read_printer_config
 
     resolver = open_machines()
     config = None if printer_cfg is None else read_printer_config(printer_cfg)
@@ -346,7 +345,7 @@ def check(
 
 
 def _stated(made: NewMachine) -> StatedMachine:
-    from stillpath.applications.machines.checks import StatedMachine
+    from stillpath.applications.machines.stated import StatedMachine
     from stillpath.applications.machines.store import check_name
 
     check_name(made.name)
@@ -361,9 +360,8 @@ def from_config(
     by: By = None,
 ) -> None:
     """Make a machine from a printer.cfg: limits and travel, with plants still to be measured."""
-    from stillpath.applications.machines.checks import machine_from_config
     from stillpath.applications.machines.klipper_config import read_printer_config
-    from stillpath.applications.machines.klipper_settings import config_notes
+    from stillpath.applications.machines.klipper_settings import config_notes, machine_from_config
     from stillpath.applications.machines.revision import source_file
 
     config = read_printer_config(file)

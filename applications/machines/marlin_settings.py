@@ -10,12 +10,8 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from stillpath.applications.machines.checks import (
-    StatedMachine,
-    derived_envelope,
-    stated_axis,
-    with_firmware,
-)
+from stillpath.applications.machines.envelope import derived_envelope, with_firmware
+from stillpath.applications.machines.stated import StatedMachine, stated_axis
 from stillpath.models.complaints import explain
 from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine

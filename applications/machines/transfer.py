@@ -8,7 +8,7 @@ from typing import Literal
 from pydantic import ValidationError
 from pydantic_core import from_json
 
-from stillpath.applications.machines.checks import with_firmware
+from stillpath.applications.machines.envelope import with_firmware
 from stillpath.applications.machines.klipper_config import (
     looks_like_printer_config,
     read_printer_config,

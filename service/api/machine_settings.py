@@ -9,10 +9,10 @@ from fastapi import APIRouter, Depends, Query, Request, Response
 from starlette.concurrency import run_in_threadpool
 
 from stillpath.applications.machines import marlin_settings
-from stillpath.applications.machines.checks import StatedMachine, machine_from_config
 from stillpath.applications.machines.klipper_config import parse_printer_config
-from stillpath.applications.machines.klipper_settings import with_config
+from stillpath.applications.machines.klipper_settings import machine_from_config, with_config
 from stillpath.applications.machines.revision import source_file
+from stillpath.applications.machines.stated import StatedMachine
 from stillpath.models.machine import Machine
 from stillpath.service.api.access import Admin
 from stillpath.service.api.machine_views import RevisionView

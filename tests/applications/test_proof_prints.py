@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stillpath.applications.machines.checks import with_firmware
+from stillpath.applications.machines.envelope import with_firmware
 from stillpath.applications.proof.coupon import coupon_program
 from stillpath.applications.proof.drive import ringing_mode
 from stillpath.applications.proof.program import PrintSettings

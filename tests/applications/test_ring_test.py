@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stillpath.applications.machines.checks import with_firmware
+from stillpath.applications.machines.envelope import with_firmware
 from stillpath.applications.proof.confirming import verify_ring
 from stillpath.applications.proof.recorders import RingSettings
 from stillpath.applications.proof.ring_figures import RingReport
