@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Iterator, Sequence
@@ -11,7 +10,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from stillpath.applications.machines.envelope import derived_envelope, with_firmware
-from stillpath.applications.machines.stated import StatedMachine, stated_axis
+from stillpath.applications.machines.stated import StatedMachine, put_fields, stated_axis
 from stillpath.models.complaints import explain
 from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
@@ -157,9 +156,7 @@ def _check_text(text: str, name: str) -> None:
     if line := _REPRAP.search(text):
         raise ModelError(
             f"{name}: {line[1]} says that these are RepRapFirmware's settings, which answers M503 "
-            "with config.g. Enter its values into a section like "
-            "examples/firmware/reprapfirmware.json (speeds of M203 and M566 divided by 60), and "
-            "give that to machines set-firmware: docs/machines.md, Another firmware"
+            "with config.g: give that to machines from-config, or to machines set-firmware"
         )
 
 
@@ -235,7 +232,7 @@ def machine_from_m503(
     section = {**ASSUMED, **firmware_section(text, file)}
     shaper = section["shaper"] or {}
     tuned = (shaper.get("freq_x_hz", 0.0), shaper.get("freq_y_hz", 0.0))
-    _set_fields(section, fields)
+    put_fields(section, fields)
     document = {
         "name": stated.name,
         "title": stated.title or stated.name,
@@ -338,27 +335,6 @@ def read_travel(text: str) -> list[tuple[float, float]]:
             "begins and ends, like -4:220x-17:227x0:250"
         )
     return pairs
-
-
-def _set_fields(section: dict[str, Any], fields: Sequence[str]) -> None:
-    """Put ``FIELD=VALUE`` into a section; a dot leads into a part of it."""
-    for field in fields:
-        place, equals, value = field.partition("=")
-        if not (place and equals and value):
-            raise ModelError(f"--set {field!r}: give FIELD=VALUE, like min_steps_per_segment=1")
-        *parts, last = place.strip().split(".")
-        inner = section
-        for part in parts:
-            inner = inner.setdefault(part, {})
-            if not isinstance(inner, dict):
-                raise ModelError(f"--set {field!r}: {part} has no fields")
-        if isinstance(inner.get(last), str):
-            inner[last] = value.strip()  # a version like 2.0 is no number
-            continue
-        try:
-            inner[last] = json.loads(value)
-        except ValueError:
-            inner[last] = value.strip()
 
 
 def _lines(text: str) -> Iterator[tuple[str, _Words]]:

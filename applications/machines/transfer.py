@@ -8,13 +8,6 @@ from typing import Literal
 from pydantic import ValidationError
 from pydantic_core import from_json
 
-from stillpath.applications.machines.envelope import with_firmware
-from stillpath.applications.machines.klipper_config import (
-    looks_like_printer_config,
-    read_printer_config,
-)
-from stillpath.applications.machines.klipper_settings import config_notes, with_config
-from stillpath.applications.machines.marlin_settings import looks_like_m503, with_m503
 from stillpath.applications.machines.revision import (
     Approval,
     Revision,
@@ -25,12 +18,10 @@ from stillpath.applications.machines.store import MachineStore
 from stillpath.models.complaints import explain
 from stillpath.models.document import Document
 from stillpath.models.errors import ModelError
-from stillpath.models.machine import Machine
-from stillpath.models.provenance import SourceFile
 from stillpath.models.store import read_machine
-from stillpath.models.user_files import as_json, as_utf8, read_bytes
+from stillpath.models.user_files import as_utf8, read_bytes
 
-__all__ = ["export_history", "import_file", "with_firmware_file"]
+__all__ = ["export_history", "import_file"]
 
 _LARGEST_BYTES = 64_000_000
 
@@ -95,44 +86,6 @@ def import_file(
         sources=[source_file(file.name, content)],
         expected=0,
     )
-
-
-def with_firmware_file(machine: Machine, file: Path) -> tuple[Machine, list[SourceFile], list[str]]:
-    """Return the machine with the firmware that a file tells, the files that were read, and notes.
-
-    Parameters
-    ----------
-    file : Path
-        A section as JSON, or what Marlin answers to M503, or Klipper's printer.cfg: of these two,
-        what they do not say stays.
-
-    Raises
-    ------
-    ModelError
-        Naming the first field of the section that is wrong.
-    """
-    content = read_bytes(file, _LARGEST_BYTES, "neither machine nor history")
-    text = as_utf8(content).decode(errors="replace")
-    if looks_like_m503(text):
-        return with_m503(machine, text, file.name), [source_file(file.name, content)], []
-    if looks_like_printer_config(text):
-        config = read_printer_config(file)
-        read = [source_file(each.name, each.read_bytes()) for each in (file, *config.included)]
-        return with_config(machine, config), read, config_notes(config)
-    try:
-        section = as_json(content, str(file))
-    except ModelError as error:
-        raise ModelError(
-            f"{error}; a firmware section as JSON is needed, an answer to M503 with its M92, or "
-            "Klipper's printer.cfg with its sections"
-        ) from None
-    if not isinstance(section, dict) or "kind" not in section:
-        raise ModelError(f"{file}: a firmware section is an object that says its kind")
-    try:
-        changed = with_firmware(machine, section)
-    except ValidationError as error:
-        raise ModelError(f"{file}: {explain(error)}") from None
-    return changed, [source_file(file.name, content)], []
 
 
 def _as_history(content: bytes, file: Path) -> _History | None:

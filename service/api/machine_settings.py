@@ -1,4 +1,4 @@
-"""Machines from a printer's own settings: Klipper's printer.cfg, Marlin's answer to M503."""
+"""Machines from a printer's own settings: printer.cfg, config.g, Marlin's answer to M503."""
 
 from __future__ import annotations
 
@@ -11,6 +11,14 @@ from starlette.concurrency import run_in_threadpool
 from stillpath.applications.machines import marlin_settings
 from stillpath.applications.machines.klipper_config import parse_printer_config
 from stillpath.applications.machines.klipper_settings import machine_from_config, with_config
+from stillpath.applications.machines.reprapfirmware_config import (
+    looks_like_config_g,
+    parse_config_g,
+)
+from stillpath.applications.machines.reprapfirmware_settings import (
+    machine_from_config_g,
+    with_config_g,
+)
 from stillpath.applications.machines.revision import source_file
 from stillpath.applications.machines.stated import StatedMachine
 from stillpath.models.machine import Machine
@@ -29,7 +37,7 @@ __all__ = ["router"]
 
 _LARGEST_BYTES = 4_000_000
 _LONGEST_UNREAD = 500
-_WANTED = "Klipper's printer.cfg, or Marlin's answer to M503"
+_WANTED = "Klipper's printer.cfg, RepRapFirmware's config.g, or Marlin's answer to M503"
 _BODY = {
     "requestBody": {
         "required": True,
@@ -89,7 +97,9 @@ async def put_settings(
     given: Annotated[_Given, Depends()],
     edit: Annotated[Edit, Depends()],
 ) -> RevisionView:
-    """Create a machine from a printer.cfg or M503's output; its plants are yet to be measured.
+    """Create a machine from its printer's settings; its plants are yet to be measured.
+
+    The settings are Klipper's printer.cfg, RepRapFirmware's config.g or Marlin's answer to M503.
 
     An existing machine is updated from it (with `If-Match`, as for PUT); what is not in it stays,
     and so do measured plants.
@@ -101,6 +111,8 @@ async def put_settings(
     def made(before: Machine | None) -> Machine:
         if before is None:
             return _new(text, file, name, given)
+        if looks_like_config_g(text):
+            return with_config_g(before, parse_config_g(text, file))
         if marlin_settings.looks_like_m503(text):
             return marlin_settings.with_m503(before, text, file)
         return with_config(before, parse_printer_config(text, file, _WANTED))
@@ -116,16 +128,21 @@ async def put_settings(
 
 
 def _message(text: str, file: str) -> str:
-    """Return what a revision is made from, and which files of a printer.cfg were not read."""
-    if marlin_settings.looks_like_m503(text):
-        return f"from {file}"
-    names = ", ".join(parse_printer_config(text, file, _WANTED).includes)
+    """Return what a revision is made from, and which files of a configuration were not read."""
+    if looks_like_config_g(text):
+        names = ", ".join(parse_config_g(text, file).unread)
+    elif marlin_settings.looks_like_m503(text):
+        names = ""
+    else:
+        names = ", ".join(parse_printer_config(text, file, _WANTED).includes)
     unread = "".join(filter(str.isprintable, names))[:_LONGEST_UNREAD]
     return f"from {file}; not read, so unknown: {unread}" if unread else f"from {file}"
 
 
 def _new(text: str, file: str, name: str, given: _Given) -> Machine:
     stated = StatedMachine(name, given.title, (given.fx, given.fy))
+    if looks_like_config_g(text):
+        return machine_from_config_g(parse_config_g(text, file), stated)
     if not marlin_settings.looks_like_m503(text):
         config = parse_printer_config(text, file, _WANTED)
         return machine_from_config(config, stated)

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
-from stillpath.applications.machines import transfer
+from stillpath.applications.machines import settings_file
 from stillpath.applications.machines.checks import check_before_job, differences
 from stillpath.applications.machines.klipper_config import read_printer_config
 from stillpath.applications.machines.store import MachineStore
@@ -183,14 +183,14 @@ def test_another_firmware_loses_no_change_made_meanwhile(
     store.add_revision("mine", make_machine(), author="anna")
     file = tmp_path / "firmware.json"
     file.write_text(make_machine().firmware.model_dump_json())
-    original = transfer.with_firmware_file
+    original = settings_file.with_firmware_file
 
     def slowly(*arguments):
         made = original(*arguments)
         store.add_revision("mine", make_machine(mesh_slope=0.02), author="bob")
         return made
 
-    monkeypatch.setattr(transfer, "with_firmware_file", slowly)
+    monkeypatch.setattr(settings_file, "with_firmware_file", slowly)
     assert machines("set-firmware", "mine", file) == 2
     assert "is at revision 2, not 1 any more" in one_line(capsys)
     assert store.current("mine").author == "bob"
@@ -223,7 +223,7 @@ def test_what_the_shell_of_windows_writes(store: MachineStore, tmp_path: Path, c
         ("approve ender3", "ender3"),
         ("import {folder}/none.json", "none.json"),
         ("put {folder}/none.json", "none.json"),
-        ("from-config {folder}/none.cfg --name ../x", "none.cfg"),
+        ("from-config {folder}/none.cfg --name ../x", "cannot be a machine's name"),
         ("export nope -o {folder}/x.json", "nope"),
         ("export ender3 -o {folder}/x.json --history --revision 1", "either"),
         ("check ender3 --printer-cfg {folder}/none.cfg", "none.cfg"),

@@ -17,6 +17,7 @@ from stillpath.models.machine import Machine
 from stillpath.models.store import builtin_machines
 from stillpath.service.api import create_app
 from stillpath.service.settings import Settings
+from tests.applications.test_machine_config_g import CONFIG_G
 from tests.applications.test_machine_m503 import M503
 from tests.cli.test_machine_cli import CONFIG
 from tests.service.machines import make_machine, make_plants
@@ -289,11 +290,27 @@ def test_a_machine_of_a_printer_cfg(client: TestClient):
     assert_problem(answer, 422, "was measured as corexy", "from-config")
 
 
+def test_a_machine_of_a_config_g(client: TestClient):
+    text = f'{CONFIG_G}M98 P"macros/fast.g"\n'
+    made = settings(client, text, file="config.g", fy=41)
+    assert made.status_code == 201, made.text
+    assert made.json()["message"] == "from config.g; not read, so unknown: macros/fast.g"
+    machine = client.get(MINE).json()
+    assert (machine["kinematics"], machine["firmware"]["ring_length"]) == ("corexy", 80)
+    assert machine["axes"]["y"]["nominal"]["modes"][0]["f_hz"] == 41
+    later = text.replace("M201 X6000", "M201 X5200")
+    again = settings(client, later, {"If-Match": made.headers["etag"]})
+    assert (again.status_code, again.json()["number"]) == (200, 2)
+    assert client.get(MINE).json()["firmware"]["x"]["max_accel_mm_s2"] == 5200
+    refused = settings(client, text.replace("M669 K1", "M669 K3"), {"If-Match": "*"})
+    assert_problem(refused, 422, "neither cartesian nor CoreXY")
+
+
 @pytest.mark.parametrize(
     ("text", "query", "words"),
     [
         ("[printer]\n", {"file": "printer.cfg"}, ["printer.cfg: [printer] lacks max_velocity"]),
-        ("{}", {}, ["settings.txt: no [section] in it", "printer.cfg, or", "answer to M503"]),
+        ("{}", {}, ["settings.txt: no [section] in it", "printer.cfg, ", "answer to M503"]),
         (M503, {"travel": "far"}, ["far", "235x235x250"]),
         (M503, {"travel": "1x1x1", "fx": "0"}, ["fx: must be at least 1 (given: '0')"]),
         (M503.replace("M92", "M93"), {"travel": "1x1x1"}, ["no M92 X in it"]),

@@ -9,6 +9,7 @@ from playwright.sync_api import expect
 
 from stillpath.applications.identification.page import interval_text
 from stillpath.reports.pages import um_text
+from tests.applications.test_machine_config_g import CONFIG_G
 from tests.applications.test_machine_m503 import M503
 from tests.models.identification.recordings import QUICK_QUERY, quick_raw
 from tests.web.machines import put
@@ -185,3 +186,23 @@ def test_a_machine_is_brought_up_to_date_by_its_printer_cfg(visitor: Visitor, tm
     page.get_by_role("button", name="Keep the settings as the next revision").click()
     expect(page.get_by_role("button", name="Show differences")).to_be_visible()
     visitor.shoot(page, "machine-of-config")
+
+
+def test_a_machine_is_made_of_a_config_g(visitor: Visitor, tmp_path: Path):
+    """It has Marlin's M92 and M203, too, and says by itself how far the axes reach."""
+    file = tmp_path / "config.g"
+    file.write_text(CONFIG_G)
+    page = visitor.open("#/machines", viewport={"width": 390, "height": 844})
+    form = page.locator("form", has=page.locator("#settings-name"))
+    form.locator("input[type=file]").set_input_files(file)
+    form.get_by_label("Name of your machine").fill("of-duet")
+    expect(page.get_by_label("How far X, Y and Z reach")).to_be_hidden()
+    page.get_by_role("button", name="Make the machine").click()
+    expect(page.get_by_role("heading", name="of-duet")).to_be_visible()
+    expect(page.locator("p.lead")).to_contain_text("reprapfirmware")
+    file.write_text(CONFIG_G.replace("M201 X6000", "M201 X5200"))
+    again = page.locator("form", has_text="Choose config.g")
+    again.locator("input[type=file]").set_input_files(file)
+    page.get_by_role("button", name="Keep the settings as the next revision").click()
+    expect(page.get_by_role("button", name="Show differences")).to_be_visible()
+    visitor.shoot(page, "machine-of-config-g")

@@ -1,4 +1,4 @@
-/** A machine of what its printer says of itself: Klipper's printer.cfg, Marlin's answer to M503. */
+/** A machine of what its printer says of itself: printer.cfg, config.g, or Marlin's answer to M503. */
 
 import { isAbort, request } from "../lib/api.js";
 import { announce } from "../lib/announce.js";
@@ -10,9 +10,10 @@ import { NAME } from "./name.js";
 const ENDS = "\\s*(-?[0-9.]+\\s*:\\s*)?[0-9.]+\\s*";
 const TRAVEL = `${ENDS}[xX]${ENDS}[xX]${ENDS}`;
 const M503 = /^.*\bM(92|201|203|204|205)\s+[A-Z]/m;
+const CONFIG_G = /^[ \t]*(M98[ \t]*P|M563\b|M566\b|M584\b|M669\b)/im;
 
 /** What the printers of a firmware say of themselves. @type {Record<string, string>} */
-export const SETTINGS = { klipper: "printer.cfg", marlin: "Marlin's answer to M503" };
+export const SETTINGS = { klipper: "printer.cfg", reprapfirmware: "config.g", marlin: "Marlin's answer to M503" };
 
 /**
  * @param {{machine: {name: string, revision: string} | null, firmware?: string, signal: AbortSignal}} about
@@ -38,8 +39,8 @@ export function settingsPanel({ machine, firmware = "", signal }) {
     send();
   } },
     dropZone(machine
-      ? { label: `Choose ${SETTINGS[firmware]}, or drop it here`, hint: "What it does not say stays as it is, and so does what was measured", accept: ".cfg,.txt,.log,.gcode,text/*", onChoose }
-      : { label: "Choose printer.cfg or Marlin's answer to M503, or drop it here", hint: "Klipper: printer.cfg. Marlin: send M503 from a host, and save all of the answer as a text file", accept: ".cfg,.txt,.log,text/*", onChoose }),
+      ? { label: `Choose ${SETTINGS[firmware]}, or drop it here`, hint: "What it does not say stays as it is, and so does what was measured", accept: ".cfg,.g,.txt,.log,.gcode,text/*", onChoose }
+      : { label: "Choose printer.cfg, config.g or Marlin's answer to M503, or drop it here", hint: "Klipper: printer.cfg. RepRapFirmware: config.g of the folder sys. Marlin: send M503 from a host, and save all of the answer as a text file", accept: ".cfg,.g,.txt,.log,text/*", onChoose }),
     machine ? null : [
       h("div.fields", null,
         field("settings-name", "Name of your machine", name, "Small letters, digits, - and _."),
@@ -52,7 +53,7 @@ export function settingsPanel({ machine, firmware = "", signal }) {
   async function onChoose([chosen]) {
     text = await chosen.text();
     file = chosen.name;
-    hide(marlin, !M503.test(text));
+    hide(marlin, CONFIG_G.test(text) || !M503.test(text));
     travel.required = !machine && !marlin.hidden;
     keep.disabled = false;
     fill(status);
