@@ -9,6 +9,9 @@ own linear part, which nobody has. Contour error while extruding.
 
     python benchmarks/closed_chain.py --printers 30 --from spectra
 
+With `--from ring` a ring test is written for resonances that were typed in, and its log identified,
+as on a printer whose firmware has no resonance test.
+
 Between measurement and print the printer may change: `--load-kg` lies on the bed of a bed slinger,
 `--belts` scales the stiffness of all belts. `--friction` scales dry friction from the start: it is
 drawn for light guides, .02 to .3 N, and wheels or a heavy bed rub with 1 to 3 N.
@@ -31,6 +34,7 @@ import numpy as np
 from firmwares import machine_with, without_macros
 from inputs import find_input, one_thread_each, plain_copy, shared_folder
 from readback import DT_S, WINDOW_S, Aligned, Motion, Own, Shaped, Timed, forced_stops, read_motion
+from ringing import identified_from_stops
 from scipy.signal import ss2zpk
 
 from stillpath.applications.machines.envelope import derived_envelope
@@ -61,7 +65,7 @@ FILES = ("ps_voron_klipper_ringing", "klipper_excludeobj_multi")
 BASES = {"bed slinger": "generic-bedslinger", "corexy": "generic-corexy"}
 _EVERY = 20
 _TUNE_S = 40.0
-_GOALS = {"spectra": (0.6, 1.05), "raw": (0.45, 1.0), "typed": (1.0, 1.05)}
+_GOALS = {"spectra": (0.6, 1.05), "raw": (0.45, 1.0), "typed": (1.0, 1.05), "ring": (0.6, 1.05)}
 _TYPED_ZETA = 0.07
 OTHERS = ("marlin", "reprapfirmware")
 _STEPS_PER_MM, _MIN_STEPS = 80.0, 6
@@ -308,8 +312,8 @@ def identified(
 ) -> tuple[Machine | None, list[tuple[str, float]], str]:
     """Return the machine that the measurement leads to, and the shapers of X and Y.
 
-    Where resonances are typed in, they are those of ZV shapers that Klipper tunes. A machine that
-    is refused prints with the shaper.
+    Where resonances are typed in, they are those of ZV shapers that Klipper tunes; so are those
+    that a ring test begins with. A machine that is refused prints with the shaper.
     """
     sensor = drawn_sensor(rng)
     test = OLD_TEST if rng.random() < 0.5 else NEW_TEST
@@ -331,15 +335,21 @@ def identified(
             assert isinstance(table, Spectrum)
             if run == 0:
                 best, every = choose_shaper_of(table)
-                if source == "typed":
-                    best = next(one for one in every if one.name == "zv")
-                    typed[axis] = typed_in(best.f_hz, _TYPED_ZETA)
+                if source in ("typed", "ring"):
+                    zv = next(one for one in every if one.name == "zv")
+                    typed[axis] = typed_in(zv.f_hz, _TYPED_ZETA)
+                    best = zv if source == "typed" else best
                 shapers.append((best.name, best.f_hz))
             log = AccelerationLog(record.time_s, record.accel_mm_s2, axis, f"raw_{axis}_{run}.csv")
             measured.append(Measured(log if source == "raw" else table))
-    if typed:
-        return base.model_copy(update={"axes": typed, "name": printer.name}), shapers, ""
+    machine = base.model_copy(update={"axes": typed or base.axes, "name": printer.name})
+    if source == "typed":
+        return machine, shapers, ""
     try:
+        if source == "ring":
+            with tempfile.TemporaryDirectory(prefix="stillpath-ring-") as folder:
+                made = identified_from_stops(printer, machine, sensor, rng, Path(folder))
+            return made, shapers, ""
         found = identify(measured, settings)
     except ModelError as error:
         return None, shapers, f"refused: {error}"

@@ -12,7 +12,13 @@ from stillpath.models.document import Document, Finite, NonNegative, Positive
 __all__ = ["ADDED", "Kind", "MeasuredMode", "Phase", "Provenance", "SourceFile"]
 
 Kind: TypeAlias = Literal[
-    "raw log", "spectrum", "frequency response", "recorded drive", "model file", "typed in"
+    "raw log",
+    "ring test",
+    "spectrum",
+    "frequency response",
+    "recorded drive",
+    "model file",
+    "typed in",
 ]
 """What a model was made of."""
 

@@ -40,9 +40,9 @@ _FRICTION_UNSURE, _WHEELS_UNSURE = 0.35, 1.0
 that far, up to half of it is not found."""
 _FRICTION_UNSEEN_MM_S2 = 1500.0
 """Dry friction over moving mass that tables may hide: .4 N on .25 kg of rails, 1.5 N on a bed."""
-_LAG_UNSURE_S = 1.5e-4
+_LAG_UNSURE_S, _LAG_UNKNOWN_S = 1.5e-4, 3e-4
 """Unknown delay of X against Y: alignment sets both to 0, but viscous guides may delay one; clocks
-of logs tell some of it (`models.identification.clocks`)."""
+of logs tell some of it (`models.identification.clocks`), those of ring tests are not compared."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +108,15 @@ def nominal_response(machine: Machine, command: Array, dt_s: float) -> Array:
     return response(pair, DryFriction(machine.friction_mm, dt_s).received_mm(command))
 
 
+def _lag_unsure_s(machine: Machine) -> float:
+    """Return the delay of one axis against the other that the members do not have already."""
+    axes = machine.axes.values()
+    if any(map(phase_unseen, axes)):
+        return 0.0  # such sets include delays
+    kinds = {axis.provenance.kind for axis in axes if axis.provenance is not None}
+    return _LAG_UNKNOWN_S if "ring test" in kinds else _LAG_UNSURE_S
+
+
 def error_ranges(
     machine: Machine,
     commands: Mapping[str, Sequence[Array]],
@@ -125,8 +134,7 @@ def error_ranges(
     """
     x, y = (plant_set(machine.axes[axis], dt_s) for axis in ("x", "y"))
     pairs = side_by_side(x.members, y.members)
-    # Sets without measured phase already include delays.
-    lag_s = 0.0 if any(map(phase_unseen, machine.axes.values())) else _LAG_UNSURE_S
+    lag_s = _lag_unsure_s(machine)
     lags = np.where(np.arange(len(pairs)) % 2, 1.0, -1.0) * lag_s / dt_s
     known_mm = np.array(machine.friction_mm)
     unseen_mm = [unseen_friction_mm(machine.axes[axis]) for axis in ("x", "y")]

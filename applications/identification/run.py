@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from datetime import date
 from pathlib import Path
 from typing import Literal, TypeAlias
 
@@ -13,6 +14,8 @@ from pydantic import ValidationError
 
 from stillpath.applications.identification.figures import IdentificationReport
 from stillpath.applications.identification.report import identification_report
+from stillpath.applications.proof.ring_identification import stops_of
+from stillpath.applications.proof.ring_motion import begins_ring_test
 from stillpath.models.complaints import explain
 from stillpath.models.errors import ModelError
 from stillpath.models.friction import usual_guides
@@ -87,6 +90,8 @@ def identify_files(
 
     Parameters
     ----------
+    files : sequence of InputFile
+        Measurements. With the G-code of a ring test among them, raw accelerations are its logs.
     base : Machine
         Source of everything that was not measured.
     name, title : str, optional
@@ -102,12 +107,16 @@ def identify_files(
     settings = settings or ReadSettings()
     if settings.guides is None:
         settings = settings.model_copy(update={"guides": usual_guides(base.kinematics)})
-    measured = _read(files, settings, progress)
+    tests = [file for file in files if begins_ring_test(file.content)]
+    measured = _read([file for file in files if file not in tests], settings, progress)
+    if tests:
+        measured = _with_stops(tests, measured, base)
     sources = [file.source for file in files]
     identified = identify(
         measured, settings, sources=sources, max_order=max_order, progress=progress
     )
     found = {axis: _with_what_is_known(base, axis, one) for axis, one in identified.items()}
+    found = {axis: _dated(one) for axis, one in found.items()}
     for axis, one in found.items():
         _check_sampled(axis, one.plants.nominal)
     machine = _with_plants(base, found, name, title)
@@ -138,6 +147,27 @@ def _read(
     return measured
 
 
+def _with_stops(
+    tests: Sequence[InputFile], measured: Sequence[Measured], base: Machine
+) -> list[Measured]:
+    """Put the stops of a ring test in the place of the raw accelerations, which are its logs."""
+    if len(tests) > 1:
+        names = ", ".join(test.name for test in tests)
+        raise ModelError(f"{names}: give one ring test with its logs at a time")
+    (test,) = tests
+    logs = [one.measurement for one in measured if isinstance(one.measurement, AccelerationLog)]
+    if not logs:
+        raise ModelError(f"{test.name} is a ring test: give what was logged while it ran, too")
+    stops = iter(stops_of(test.content, test.name, logs, base))
+    found: list[Measured] = []
+    for one in measured:
+        if isinstance(one.measurement, AccelerationLog):
+            found += [Measured(each, one.condition) for each in next(stops)]
+        else:
+            found.append(one)
+    return found
+
+
 def _check_recorded_once(first: InputFile, file: InputFile) -> None:
     """Refuse the recording of a test that is given as one of another axis or condition, too."""
     if first is not file:
@@ -147,6 +177,17 @@ def _check_recorded_once(first: InputFile, file: InputFile) -> None:
             "writes the table of Y as that of X, too, after SHAPER_CALIBRATE AXIS=Y: run "
             "TEST_RESONANCES AXIS=X, then AXIS=Y)"
         )
+
+
+def _dated(found: AxisIdentification) -> AxisIdentification:
+    """Date a ring test whose logs do not say when they were taken: today."""
+    about = found.plants.provenance
+    if about is None or about.kind != "ring test" or about.measured_on is not None:
+        return found
+    about = about.model_copy(update={"measured_on": date.today()})
+    note = "no date in the names of its logs: taken as measured today"
+    plants = found.plants.model_copy(update={"provenance": about})
+    return replace(found, plants=plants, notes=(*found.notes, note))
 
 
 def _check_sampled(axis: Axis, plant: PlantSpec) -> None:

@@ -24,10 +24,12 @@ from stillpath.applications.proof.ring_log import (
     floor,
     joined,
     lag_s,
+    misplaced,
     misses,
     place,
     read_axis,
     residual,
+    unusable,
 )
 from stillpath.applications.proof.ring_motion import (
     RATE_HZ,
@@ -50,9 +52,6 @@ __all__ = ["verify_ring"]
 _RINGS = 0.3
 """Damping ratio above which nothing rings after a stop."""
 _HIGHEST_HZ = 200.0
-_MATCHED, _CORRELATED = 0.5, 0.8
-_GAINS = (0.6, 1.6)
-"""A sensor may be 16 % off, and a frame excited by reaction adds up to about 30 %."""
 _FEWEST_STOPS, _SEEN_SHARE = 4, 0.7
 _ABOVE_FLOOR = 3.0
 _SIGMAS = 2.0
@@ -101,12 +100,8 @@ def verify_ring(
         except ModelError as error:
             _give_reason(axes.values(), str(error))
             continue
-        if found.explained < _MATCHED or found.plan_end_s <= found.plan_start_s:
-            _give_reason(
-                axes.values(),
-                f"{source.name} is not of this file: the best place explains "
-                f"{100 * found.explained:.0f} % of what the sensor felt between 2 and 22 Hz",
-            )
+        if reason := misplaced(source.name, found):
+            _give_reason(axes.values(), reason)
             continue
         for name, axis in axes.items():
             own = nominal[AXES.index(name)]
@@ -240,16 +235,9 @@ class _Axis:
     def _unusable(self, name: str, log: AxisLog | None) -> str:
         """Return why a log is unusable for the axis; empty if it is usable."""
         axis = self._axis.upper()
-        if log is None:
-            return f"{name} was not taken while the file moved {axis}"
-        if not _GAINS[0] <= log.gain <= _GAINS[1] or log.correlation < _CORRELATED:
-            return (
-                f"in {name} the sensor felt {log.gain:.2f} of the commanded motion of {axis} "
-                f"(correlation {log.correlation:.2f}, 3 to 20 Hz): it is not fixed to the part "
-                f"that moves in {axis}, or its scale is wrong"
-            )
-        if log.clipped:
-            return f"{name}: {log.clipped}"
+        reason = unusable(name, log, self._axis)
+        if reason or log is None:
+            return reason
         seen = [sum(s.compensated is half for s in log.seen) for half in (False, True)]
         if min(seen) < _FEWEST_STOPS or len(log.seen) < _SEEN_SHARE * log.within:
             return (

@@ -27,10 +27,12 @@ __all__ = [
     "floor",
     "joined",
     "lag_s",
+    "misplaced",
     "misses",
     "place",
     "read_axis",
     "residual",
+    "unusable",
 ]
 
 WINDOW_S = (0.01, 0.31)
@@ -40,6 +42,9 @@ _BRAKING_S = 0.06
 """Time on both sides of the braking that is checked for it in the log."""
 _COHERENT = 0.6
 _TAPER = 0.2
+_MATCHED, _CORRELATED = 0.5, 0.8
+_GAINS = (0.6, 1.6)
+"""A sensor may be 16 % off, and a frame excited by reaction adds up to about 30 %."""
 _EDGE_S = 0.1
 _KEPT_HZ = (0.5, 0.4 * RATE_HZ)
 """Pass band of the log: removes what could alias into the compared band."""
@@ -161,6 +166,29 @@ def read_axis(
         len(within),
         " ".join(check_range(recorded)),
     )
+
+
+def misplaced(name: str, found: Match) -> str:
+    """Return why a log has no place in the file; empty if it has."""
+    if found.explained >= _MATCHED and found.plan_end_s > found.plan_start_s:
+        return ""
+    return (
+        f"{name} is not of this file: the best place explains {100 * found.explained:.0f} % of "
+        "what the sensor felt between 2 and 22 Hz"
+    )
+
+
+def unusable(name: str, log: AxisLog | None, axis: Axis) -> str:
+    """Return why a log says nothing of an axis; empty if it does."""
+    if log is None:
+        return f"{name} was not taken while the file moved {axis.upper()}"
+    if not _GAINS[0] <= log.gain <= _GAINS[1] or log.correlation < _CORRELATED:
+        return (
+            f"in {name} the sensor felt {log.gain:.2f} of the commanded motion of {axis.upper()} "
+            f"(correlation {log.correlation:.2f}, 3 to 20 Hz): it is not fixed to the part "
+            f"that moves in {axis.upper()}, or its scale is wrong"
+        )
+    return f"{name}: {log.clipped}" if log.clipped else ""
 
 
 def residual(accel: Array, stops: Sequence[Stop], band: FrequencyBand) -> Power:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +32,14 @@ from stillpath.pipeline.file_dialect import dialect_for
 from stillpath.pipeline.file_motion import TextMotion
 from stillpath.simulation.response import PlantStream
 
-__all__ = ["RingMotion", "Stop", "is_ring_test", "read_ring_motion"]
+__all__ = [
+    "RingMotion",
+    "Stop",
+    "begins_ring_test",
+    "is_ring_test",
+    "read_ring_motion",
+    "ring_motion",
+]
 
 RATE_HZ = 1000.0
 _HEAD_BYTES = 4096
@@ -62,6 +70,8 @@ class RingMotion:
     ----------
     command : Signal
         Positions of X and Y in mm, as ripple and dry friction let the axes have them.
+    planned_mm : ndarray, shape (2, n)
+        The same before dry friction.
     added_mm : ndarray, shape (2, n)
         Deviation of the tool on top of that, by ripple on the output side.
     quiet_s : dict
@@ -74,6 +84,7 @@ class RingMotion:
     """
 
     command: Signal
+    planned_mm: Array
     added_mm: Array
     stops: tuple[Stop, ...]
     quiet_s: dict[Axis, list[tuple[float, float]]]
@@ -95,7 +106,12 @@ class RingMotion:
 def is_ring_test(printed: Path) -> bool:
     """Whether a file is marked as a ring test."""
     with printed.open("rb") as file:
-        return file.read(_HEAD_BYTES).startswith(f"; {TITLE}".encode())
+        return begins_ring_test(file.read(_HEAD_BYTES))
+
+
+def begins_ring_test(content: bytes) -> bool:
+    """Whether a file that begins so is marked as a ring test."""
+    return content.startswith(f"; {TITLE}".encode())
 
 
 def read_ring_motion(printed: Path, machine: Machine) -> RingMotion:
@@ -113,13 +129,19 @@ def read_ring_motion(printed: Path, machine: Machine) -> RingMotion:
             f"{printed.name} is not a ring test: write one (`stillpath ring-test`), and give the "
             "file as it was written"
         )
+    return ring_motion(printed.read_bytes(), printed.name, machine)
+
+
+def ring_motion(content: bytes, name: str, machine: Machine) -> RingMotion:
+    """Return what `read_ring_motion` does, of a ring test's content; `name` is for messages."""
     rows, numbers = [], []
-    with printed.open("rb") as file:
-        motion = TextMotion(file, machine, dialect_for(machine, None), 1.0 / RATE_HZ)
-        for part in motion:
-            rows.append(part.samples.xyz_mm[:2])
-            numbers.append(part.moves.feature[part.samples.move_index - part.first_move])
-        names = motion.reader.feature_names
+    motion = TextMotion(BytesIO(content), machine, dialect_for(machine, None), 1.0 / RATE_HZ)
+    for part in motion:
+        rows.append(part.samples.xyz_mm[:2])
+        numbers.append(part.moves.feature[part.samples.move_index - part.first_move])
+    names = motion.reader.feature_names
+    if not rows:
+        raise ModelError(f"{name} moves nothing: give the file as written")
     command, feature = np.concatenate(rows, axis=1), np.concatenate(numbers)
     stops: list[Stop] = []
     quiet: dict[Axis, list[tuple[float, float]]] = {}
@@ -127,7 +149,7 @@ def read_ring_motion(printed: Path, machine: Machine) -> RingMotion:
     for k, axis in enumerate(AXES):
         wanted = [region(axis, part) for part in PARTS]
         if not set(wanted) <= set(names):
-            raise ModelError(f"{printed.name} has no stops of {axis}: give the file as written")
+            raise ModelError(f"{name} has no stops of {axis}: give the file as written")
         own = {part: feature == names.index(region(axis, part)) for part in PARTS}
         speed = np.abs(np.diff(command[k], prepend=command[k, 0])) * RATE_HZ
         for half in ("off", "on"):
@@ -137,14 +159,15 @@ def read_ring_motion(printed: Path, machine: Machine) -> RingMotion:
     stops.sort(key=lambda stop: stop.at_s)
     ripple = MachineRipple(machine.kinematics, machine.ripple)
     friction = DryFriction(machine.friction_mm, 1.0 / RATE_HZ)
-    received = friction.received_mm(ripple.received_mm(command))
+    planned = ripple.received_mm(command)
     return RingMotion(
-        Signal(0.0, 1.0 / RATE_HZ, received),
+        Signal(0.0, 1.0 / RATE_HZ, friction.received_mm(planned)),
+        planned,
         ripple.added_mm(command),
         tuple(stops),
         quiet,
         about,
-        _plants(printed),
+        _plants(content),
     )
 
 
@@ -173,8 +196,7 @@ def _stops(
     return out
 
 
-def _plants(printed: Path) -> dict[Axis, str]:
+def _plants(content: bytes) -> dict[Axis, str]:
     """Return the plant digests in the first lines of the file."""
-    with printed.open("rb") as file:
-        head = file.read(_HEAD_BYTES).decode("utf-8", "replace")
+    head = content[:_HEAD_BYTES].decode("utf-8", "replace")
     return {axis: digest for axis in AXES for digest in re.findall(plants_line(axis, _HEX), head)}

@@ -1,4 +1,4 @@
-"""The plants of an axis from frequency responses: of drives, of raw logs, or measured elsewhere."""
+"""The plants of an axis from frequency responses: of drives, logs, stops, or measured elsewhere."""
 
 from __future__ import annotations
 
@@ -29,15 +29,28 @@ from stillpath.models.identification.raw_logs import (
     without_friction,
 )
 from stillpath.models.identification.sets import response_set
-from stillpath.models.identification.types import AxisIdentification, Fit, FrequencyResponse
+from stillpath.models.identification.stops import responses_of_stops
+from stillpath.models.identification.types import (
+    AxisIdentification,
+    Fit,
+    FrequencyResponse,
+    StopsLog,
+)
 
-__all__ = ["ResponseRun", "from_logs", "from_responses"]
+__all__ = ["ResponseRun", "StopsRun", "from_logs", "from_responses", "from_stops"]
 
 
 class ResponseRun(NamedTuple):
     """A response, and under what condition it was measured."""
 
     response: FrequencyResponse
+    condition: Condition
+
+
+class StopsRun(NamedTuple):
+    """A log of stops, and under what condition it was measured."""
+
+    log: StopsLog
     condition: Condition
 
 
@@ -50,6 +63,20 @@ def from_responses(task: IdentificationTask, runs: Sequence[ResponseRun]) -> Axi
     warnings += frame_mode_warnings(prompt(nominal), found.plants.nominal)
     found = replace(found, warnings=(*found.warnings, *warnings))
     return _scheduled(task, found, nominal, runs, common)
+
+
+def from_stops(task: IdentificationTask, runs: Sequence[StopsRun]) -> AxisIdentification:
+    """Return the axis with plants and dry friction that explain its stops in ring tests."""
+    conditions = [run.condition for run in runs]
+    found = responses_of_stops(
+        [run.log for run in runs],
+        [condition.label for condition in conditions],
+        frame_firm=task.settings.frame_firm or bool(special(conditions)),
+    )
+    axis = from_responses(task, list(map(ResponseRun, found.responses, conditions)))
+    plants = axis.plants.with_friction(found.held_mm) if found.held_mm else axis.plants
+    notes = (*axis.notes, *body_notes(found.held_mm, found.frame))
+    return replace(axis, plants=plants, notes=notes)
 
 
 def from_logs(

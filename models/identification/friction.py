@@ -32,9 +32,18 @@ from stillpath.models.identification.local_model import (
 from stillpath.models.identification.types import FrequencyResponse
 from stillpath.models.plants import MOST_FRICTION_MM, PlantSetSpec
 
-__all__ = ["Friction", "better_explained", "dry_friction", "freed"]
+__all__ = [
+    "CLEARLY",
+    "SIZES_MM",
+    "Friction",
+    "better_explained",
+    "beyond_slow",
+    "dry_friction",
+    "freed",
+    "lowest_size",
+]
 
-_SIZES_MM = 1e-3 * np.array(
+SIZES_MM = 1e-3 * np.array(
     [0.0, 0.5, 1.0, 2.0, 3.5, 5.0, 7.0, 10.0, 14.0, 20.0, 28.0, 40.0, 57.0, 80.0, 100.0]
 )
 _LATE_S = 1e-3 * np.array([-1.0, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0])
@@ -42,7 +51,7 @@ _HIGHEST_HZ, _BELOW, _STEP_HZ, _HALF_BAND_HZ = 35.0, 0.7, 0.5, 1.0
 _LEAST_HZ = 4.0
 """Width of the band that must be left below the resonance."""
 _TAPER = 0.01
-_CLEARLY = 0.01
+CLEARLY = 0.01
 """Logarithm of the ratio of residuals with friction and without."""
 _ABOVE, _CLEARLY_STUCK = 1.1, 0.3
 """Guides stick above the resonance, if the logarithm of the residual falls by this on average."""
@@ -92,9 +101,9 @@ def dry_friction(
     motion = int(np.argmin([left.mean(axis=0).min() for left in rows]))
     left = rows[motion].mean(axis=0)
     late = int(np.argmin(left.min(axis=1)))
-    held_mm = _lowest(left[late])
-    alone = [_lowest(one[int(np.argmin(one.min(axis=1)))]) for one in rows[motion]]
-    clear = left[:, 0].min() - left.min() > _CLEARLY
+    held_mm = lowest_size(left[late])
+    alone = [lowest_size(one[int(np.argmin(one.min(axis=1)))]) for one in rows[motion]]
+    clear = left[:, 0].min() - left.min() > CLEARLY
     agree = max(alone) - min(alone) <= _APART * held_mm
     # Where the residual still falls at the latest start that was tried, it has no minimum.
     clear = clear and late < len(_LATE_S) - 1
@@ -163,19 +172,19 @@ def _left(aligned: AlignedLog, response: FrequencyResponse) -> Array:
         found = local_response([Transformed(spacing_hz, received, measured)], f_hz, _HALF_BAND_HZ)
         return float(np.mean(log_residual(found.coherence)))
 
-    return np.array([[left(late_s, size_mm) for size_mm in _SIZES_MM] for late_s in _LATE_S])
+    return np.array([[left(late_s, size_mm) for size_mm in SIZES_MM] for late_s in _LATE_S])
 
 
 def _earlier(f_hz: Array, late_s: float) -> Complex:
     return np.asarray(np.exp(2j * np.pi * f_hz * late_s))
 
 
-def _lowest(left: Array) -> float:
+def lowest_size(left: Array) -> float:
     """Return the minimum of a parabola through the lowest value and its neighbours."""
     i = int(np.clip(np.argmin(left), 1, len(left) - 2))
     near = slice(i - 1, i + 2)
-    bend, slope, _ = np.polyfit(_SIZES_MM[near], left[near], 2)
-    lowest = -0.5 * slope / bend if bend > 0 else _SIZES_MM[int(np.argmin(left))]
+    bend, slope, _ = np.polyfit(SIZES_MM[near], left[near], 2)
+    lowest = -0.5 * slope / bend if bend > 0 else SIZES_MM[int(np.argmin(left))]
     return float(np.clip(lowest, 0.0, MOST_FRICTION_MM))
 
 
@@ -188,13 +197,13 @@ def _bend_rate(aligned: AlignedLog, response: FrequencyResponse) -> Array:
     f_hz = rfftfreq(size, step_s)
     s_squared = -((2 * np.pi * np.maximum(f_hz, f_hz[1])) ** 2)
     # Slow motion is followed exactly; the deviation from it is short and has no drift.
-    extra = irfft(_extra(response, f_hz) / s_squared * rfft(accel, size), size)[: len(accel)]
+    extra = irfft(beyond_slow(response, f_hz) / s_squared * rfft(accel, size), size)[: len(accel)]
     bend = bend_of(way + extra)
     return np.pad(np.diff(bend, 2), 1) / step_s**2
 
 
-def _extra(response: FrequencyResponse, f_hz: Array) -> Complex:
-    """Return G - 1 as it was measured, its level set aside."""
+def beyond_slow(response: FrequencyResponse, f_hz: Array) -> Complex:
+    """Return G - 1 as it was measured, its level set aside, at the frequencies `f_hz`."""
     own_hz = response.f_hz
     level = plateau_gain(response) or float(np.median(np.abs(response.response[:9])))
     sign = 1.0 if response.response[: max(3, len(own_hz) // 20)].real.sum() >= 0 else -1.0

@@ -14,8 +14,10 @@ from typing import TypeAlias
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.axis_from_responses import (
     ResponseRun,
+    StopsRun,
     from_logs,
     from_responses,
+    from_stops,
 )
 from stillpath.models.identification.axis_from_spectra import (
     ExplainedRuns,
@@ -58,6 +60,7 @@ from stillpath.models.identification.types import (
     Measurement,
     PlantModel,
     Spectrum,
+    StopsLog,
 )
 from stillpath.models.notes import by_file, parted
 from stillpath.models.provenance import Kind, SourceFile
@@ -69,12 +72,13 @@ Progress: TypeAlias = Callable[[str, float], None]
 
 _KINDS: dict[type, Kind] = {
     AccelerationLog: "raw log",
+    StopsLog: "ring test",
     DrivenLog: "recorded drive",
     FrequencyResponse: "frequency response",
     Spectrum: "spectrum",
     PlantModel: "model file",
 }
-_BEST_FIRST = (PlantModel, AccelerationLog, DrivenLog, FrequencyResponse, Spectrum)
+_BEST_FIRST = (PlantModel, AccelerationLog, StopsLog, DrivenLog, FrequencyResponse, Spectrum)
 """Where an axis has measurements of several kinds, the first kind is used."""
 
 
@@ -214,6 +218,8 @@ class _AxisWork:
             case "raw log":
                 felt = [self._log(one) for one in self._used]
                 found, self.late = from_logs(self._task, felt, frame_likely)
+            case "ring test":
+                found = from_stops(self._task, [self._stops(one) for one in self._used])
             case _:
                 found = from_responses(self._task, [self._response(one) for one in self._used])
         self._steps.stepped(f"axis {self._axis}: fitted")
@@ -264,6 +270,11 @@ class _AxisWork:
         )
         self._steps.stepped(what)
         return run
+
+    def _stops(self, one: Measured) -> StopsRun:
+        assert isinstance(one.measurement, StopsLog)
+        self._steps.stepped(f"axis {self._axis}: {one.measurement.source}")
+        return StopsRun(one.measurement, one.condition)
 
     def _response(self, one: Measured) -> ResponseRun:
         measurement, label = one.measurement, one.condition.label

@@ -51,6 +51,7 @@ __all__ = [
 
 _PARAMETRIC_SPREAD: dict[Kind, tuple[float, float]] = {
     "raw log": (0.02, 0.20),
+    "ring test": (0.02, 0.20),
     "frequency response": (0.02, 0.20),
     "recorded drive": (0.02, 0.20),
     "spectrum": (0.03, 0.50),

@@ -27,6 +27,7 @@ __all__ = [
     "OrderTrial",
     "PlantModel",
     "Spectrum",
+    "StopsLog",
 ]
 
 Axis: TypeAlias = Literal["x", "y"]
@@ -110,6 +111,29 @@ class DrivenLog:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class StopsLog:
+    """Sudden stops of one axis as they were planned, and the acceleration that followed.
+
+    Attributes
+    ----------
+    command_mm : ndarray, shape (n,)
+        Planned positions, before dry friction.
+    measured_mm_s2 : ndarray, shape (n,)
+        Along the axis, on the time of the plan up to a millisecond or so.
+    parts : tuple of (int, int)
+        First sample and end of each part that was measured; it begins and ends at rest.
+    """
+
+    rate_hz: float
+    command_mm: Array
+    measured_mm_s2: Array
+    parts: tuple[tuple[int, int], ...]
+    axis: str | None = None
+    source: str = ""
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Spectrum:
     """Power spectral densities of acceleration, one-sided, as Klipper's Welch makes them.
 
@@ -170,7 +194,9 @@ class PlantModel:
     notes: tuple[str, ...] = ()
 
 
-Measurement: TypeAlias = AccelerationLog | DrivenLog | Spectrum | FrequencyResponse | PlantModel
+Measurement: TypeAlias = (
+    AccelerationLog | StopsLog | DrivenLog | Spectrum | FrequencyResponse | PlantModel
+)
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ from pydantic import Field, field_validator, model_validator
 from stillpath.models.document import Document, NonNegative, Positive
 from stillpath.models.errors import ModelError
 from stillpath.models.friction import Guides
-from stillpath.models.identification.types import AccelerationLog, Axis, Measurement
+from stillpath.models.identification.types import AccelerationLog, Axis, Measurement, StopsLog
 
 __all__ = ["ReadSettings", "direction_of", "tested_axis"]
 
@@ -20,9 +20,9 @@ Column = str | Annotated[int, Field(ge=0)]
 """By name, or counted from 0."""
 
 _NO_TEST = (
-    "RepRapFirmware has no resonance test of its own, and its log does not say what moved: type "
-    "the frequencies in (machines from-config, --fx and --fy) and let verify read the log of a "
-    "ring-test, or record command and acceleration together"
+    "RepRapFirmware has no resonance test of its own, and its log does not say what moved: log a "
+    "ring-test, and give its G-code together with the logs, or record command and acceleration "
+    "together"
 )
 _DIAGONAL = re.compile(r"-?\d+(\.\d+)?,-?\d+(\.\d+)?(,-?\d+(\.\d+)?)?")
 _DAY = re.compile(r"\d{4}-\d\d-\d\d")
@@ -146,7 +146,9 @@ def tested_axis(measurement: Measurement, settings: ReadSettings) -> Axis:
     """
     if isinstance(measurement, AccelerationLog) and not measurement.may_hold_test:
         raise ModelError(f"{measurement.source}: {_NO_TEST}")
-    text = settings.axis or measurement.axis
+    text = measurement.axis
+    if not isinstance(measurement, StopsLog):
+        text = settings.axis or text
     if text is None:
         raise ModelError(
             f"{measurement.source}: neither the file nor its name says which axis it is of; "
