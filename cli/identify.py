@@ -180,7 +180,9 @@ def identify(
     ripple: RippleOptions,
     note: RevisionNote,
 ) -> None:
-    """Build a machine model from measurements: resonance tests, recorded drives, responses, models.
+    """Build a machine model from measurements: resonance tests, drives, responses, models.
+
+    Also from a ring test: its G-code, and what was logged while it ran.
 
     Without --machine and --output nothing is stored: the figures are printed.
     """

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from stillpath.applications.proof.ring_log import AxisLog, misplaced, place, read_axis, unusable
 from stillpath.applications.proof.ring_motion import RATE_HZ, RingMotion, ring_motion
 from stillpath.applications.proof.ring_test import AXES, Axis
+from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.types import AccelerationLog, StopsLog
 from stillpath.models.machine import Machine
@@ -17,7 +19,9 @@ from stillpath.models.runs import runs
 __all__ = ["stops_of"]
 
 _SHORTEST_S = 0.5
-_FEWEST_STOPS = 4
+_FEWEST_STOPS = 8
+_GAINS, _CORRELATED = (0.4, 2.5), 0.5
+"""Of a sensor on what moves, with plants that may be far off."""
 _LEAD = round(0.06 * RATE_HZ)
 """Time by which a compensated move begins before its line. Until then the axis creeps."""
 
@@ -40,41 +44,57 @@ def stops_of(
     Raises
     ------
     GcodeError, ModelError
-        If the file cannot be read, or a log shows no axis of it.
+        If the file cannot be read, a log is not of it, or none shows an axis.
     """
     motion = ring_motion(content, name, machine)
     predicted = np.stack([motion.predicted(axis, machine.axes[axis].nominal) for axis in AXES])
-    return [_stops_in(log, motion, predicted) for log in logs]
+    read = [_read(log, motion, predicted) for log in logs]
+    unknown = [
+        f"{axis.upper()} is not measured, its plants stay: "
+        f"{'; '.join(one.reasons[axis] for one in read)}"
+        for axis in AXES
+        if not any(axis in one.felt for one in read)
+    ]
+    if len(unknown) == len(AXES):
+        raise ModelError("; ".join(unknown))
+    return [
+        [_stops(log, felt, motion, axis, unknown) for axis, felt in one.felt.items()]
+        for log, one in zip(logs, read, strict=True)
+    ]
 
 
-def _stops_in(log: AccelerationLog, motion: RingMotion, predicted: np.ndarray) -> list[StopsLog]:
+@dataclass(slots=True)
+class _Read:
+    """The axes of a log, and why it says nothing of others."""
+
+    felt: dict[Axis, AxisLog] = field(default_factory=dict)
+    reasons: dict[Axis, str] = field(default_factory=dict)
+
+
+def _read(log: AccelerationLog, motion: RingMotion, predicted: Array) -> _Read:
     signal, found = place(log, predicted)
     if reason := misplaced(log.source, found):
         raise ModelError(f"{reason}; give the logs of this ring test, and its machine")
-    stops, reasons = [], []
+    read = _Read()
     for row, axis in zip(predicted, AXES, strict=True):
         felt = read_axis(log, signal, found, motion, row, axis)
-        reason = unusable(log.source, felt, axis) or _too_few(log.source, felt, axis)
-        if reason or felt is None:
-            reasons.append(reason)
+        # How well the motion follows is judged with the plants that will be found, not with these.
+        reason = unusable(log.source, felt, axis, gains=_GAINS, correlated=_CORRELATED)
+        if felt is not None and not reason and felt.within < _FEWEST_STOPS:
+            reason = (
+                f"{log.source} shows {felt.within} stops of {axis.upper()}, and {_FEWEST_STOPS} "
+                "are needed: log the whole file"
+            )
+        if felt is None or reason:
+            read.reasons[axis] = reason
         else:
-            stops.append(_stops(log, felt, motion, axis))
-    if not stops:
-        raise ModelError("; ".join(reasons))
-    return stops
+            read.felt[axis] = felt
+    return read
 
 
-def _too_few(name: str, felt: AxisLog | None, axis: Axis) -> str:
-    seen = 0 if felt is None else len([stop for stop in felt.seen if not stop.compensated])
-    if seen >= _FEWEST_STOPS:
-        return ""
-    return (
-        f"{name} shows {seen} stops of {axis.upper()} as planned, and {_FEWEST_STOPS} are needed: "
-        "log the whole file"
-    )
-
-
-def _stops(log: AccelerationLog, felt: AxisLog, motion: RingMotion, axis: Axis) -> StopsLog:
+def _stops(
+    log: AccelerationLog, felt: AxisLog, motion: RingMotion, axis: Axis, notes: Sequence[str]
+) -> StopsLog:
     planned = motion.planned_mm[AXES.index(axis)]
     parts = [
         (max(first - _LEAD, 0), end)
@@ -88,5 +108,5 @@ def _stops(log: AccelerationLog, felt: AxisLog, motion: RingMotion, axis: Axis) 
         tuple((first, end) for first, end in parts if felt.inside[first:end].all()),
         axis,
         log.source,
-        log.notes,
+        (*log.notes, *notes),
     )

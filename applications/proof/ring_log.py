@@ -42,8 +42,8 @@ _BRAKING_S = 0.06
 """Time on both sides of the braking that is checked for it in the log."""
 _COHERENT = 0.6
 _TAPER = 0.2
-_MATCHED, _CORRELATED = 0.5, 0.8
-_GAINS = (0.6, 1.6)
+_MATCHED, CORRELATED = 0.5, 0.8
+GAINS = (0.6, 1.6)
 """A sensor may be 16 % off, and a frame excited by reaction adds up to about 30 %."""
 _EDGE_S = 0.1
 _KEPT_HZ = (0.5, 0.4 * RATE_HZ)
@@ -178,11 +178,24 @@ def misplaced(name: str, found: Match) -> str:
     )
 
 
-def unusable(name: str, log: AxisLog | None, axis: Axis) -> str:
-    """Return why a log says nothing of an axis; empty if it does."""
+def unusable(
+    name: str,
+    log: AxisLog | None,
+    axis: Axis,
+    *,
+    gains: tuple[float, float] = GAINS,
+    correlated: float = CORRELATED,
+) -> str:
+    """Return why a log says nothing of an axis; empty if it does.
+
+    Parameters
+    ----------
+    gains, correlated : (float, float), float
+        What its gain and its correlation must be.
+    """
     if log is None:
         return f"{name} was not taken while the file moved {axis.upper()}"
-    if not _GAINS[0] <= log.gain <= _GAINS[1] or log.correlation < _CORRELATED:
+    if not gains[0] <= log.gain <= gains[1] or log.correlation < correlated:
         return (
             f"in {name} the sensor felt {log.gain:.2f} of the commanded motion of {axis.upper()} "
             f"(correlation {log.correlation:.2f}, 3 to 20 Hz): it is not fixed to the part "

@@ -47,6 +47,8 @@ _COMPARED_HZ, _COMPARED_STEP_HZ, _COMPARED_HALF_BAND_HZ = (5.0, 60.0), 0.5, 2.0
 _RATES = 2e-5 * np.arange(-25, 26)
 """Errors of the clock's rate that are tried: a millisecond in 50 s apart."""
 _LEAST_FOLLOWED = 0.15
+_SLOW_HZ, _LEVELS = 12.0, (0.6, 1.6)
+"""A sensor may be 16 % off, and a frame excited by reaction adds up to about 30 %."""
 _ROUNDS = 2
 """The bend of the guides follows a motion that is the better known the less friction is in it."""
 
@@ -202,6 +204,13 @@ def _held_mm(logs: Sequence[StopsLog], bends: Sequence[Array]) -> float:
 
 
 def _check_followed(response: FrequencyResponse) -> None:
+    slow = (response.f_hz <= _SLOW_HZ) & (response.coherence >= LEAST_COHERENCE)
+    level = float(np.median(np.abs(response.response[slow]))) if slow.any() else 1.0
+    if not _LEVELS[0] <= level <= _LEVELS[1]:
+        raise ModelError(
+            f"{response.source}: the sensor felt {level:.2f} of the slow motion of axis "
+            f"{response.axis}: it is not fixed to the part that moves, or its scale is wrong"
+        )
     share = float(np.mean(response.coherence >= LEAST_COHERENCE))
     if share < _LEAST_FOLLOWED:
         raise ModelError(

@@ -138,8 +138,9 @@ async def post_measurements(
 ) -> Any:
     """Identify the plants of the measured axes, and store them as a new revision of the machine.
 
-    Accepts resonance tests (raw or spectra), recorded drives, frequency responses and models. If a
-    file cannot be used, the answer names it and the reason, and nothing is stored.
+    Accepts resonance tests (raw or spectra), ring tests (the G-code and its logs), recorded drives,
+    frequency responses and models. If a file cannot be used, the answer names it and the reason,
+    and nothing is stored.
     """
     machines: Resolver = request.app.state.machines
     if not trial:

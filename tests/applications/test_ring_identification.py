@@ -130,6 +130,8 @@ def test_a_log_of_one_axis_leaves_the_other_as_it_was(ring: Path) -> None:
     made = identify_files([test_of(ring), InputFile("adxl345-head.csv", content)], typed())
     assert made.machine.axes["y"] == typed().axes["y"]
     assert made.machine.axes["x"].provenance.kind == "ring test"
+    (said,) = [note for note in made.report.axes[0].notes if "Y is not measured" in note]
+    assert "it is not fixed to the part that moves in Y" in said
 
 
 @pytest.mark.slow
@@ -164,7 +166,7 @@ def test_reprapfirmware_is_measured_by_its_own_recorder(cache: Path, tmp_path: P
         (("ring", "other"), "other.csv is not of this file"),
         (
             ("ring", "beginning"),
-            "shows 2 stops of X as planned, and 4 are needed: log the whole file",
+            "shows 2 stops of X, and 8 are needed: log the whole file",
         ),
     ],
 )
@@ -181,6 +183,25 @@ def test_what_is_refused(ring: Path, log: InputFile, names: tuple[str, ...], wor
     }
     with pytest.raises(ModelError, match=words):
         identify_files([files[name] for name in names], typed())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stated", [{"x": 62.0, "y": 26.0}, {"x": 33.0, "y": 50.0}])
+def test_the_stated_resonances_may_be_far_off(
+    stated: dict[str, float], cache: Path, tmp_path: Path
+) -> None:
+    axes = {axis: typed_in(f_hz, 0.07) for axis, f_hz in stated.items()}
+    machine = typed().model_copy(update={"axes": axes})
+    ring = tmp_path / "ring.gcode"
+    write_ring_test(machine, ring, cache_dir=cache)
+    content = recorded(ring, machine).raw_data()
+    made = identify_files([test_of(ring), InputFile("adxl345-a.csv", content)], machine)
+    for axis, chain in TRUE.items():
+        f_hz = np.arange(5.0, 1.2 * chain.f_hz[0])
+        truth = chain.spec()
+        _, want = freqs(truth.num, truth.den, 2 * np.pi * f_hz)
+        got = frequency_response(made.machine.axes[axis].nominal, f_hz)
+        assert np.linalg.norm(got - want) / np.linalg.norm(want) < 0.15
 
 
 @pytest.mark.slow

@@ -36,7 +36,7 @@ export function measurementPanel({ machines, base, own = false, signal }) {
     event.preventDefault();
     send(chosen(), true);
   } },
-    dropZone({ label: "Choose measurements, or drop them here", hint: "Klipper's raw_data_*.csv or resonances_*.csv, Shake&Tune's .stdata, frequency responses, recordings; several at once", accept: ".csv,.txt,.json,.mat,.stdata,.gz,.zst,text/*", multiple: true,
+    dropZone({ label: "Choose measurements, or drop them here", hint: "Klipper's raw_data_*.csv or resonances_*.csv, Shake&Tune's .stdata, a ring test with its logs, frequency responses, recordings; several at once", accept: ".csv,.txt,.json,.mat,.stdata,.gcode,.gz,.zst,text/*", multiple: true,
       onChoose: (chosen) => {
         files = chosen;
         look.disabled = false;
