@@ -128,11 +128,15 @@ def ring_test(
     from stillpath.applications.proof.ring_test import write_ring_test
     from stillpath.cli.console import progress_shown
     from stillpath.cli.proof_tables import print_proof
+    from stillpath.models.typed_in import stated_hz
 
     settings = RingSettings(chip, chip_y, _text(start_gcode))
     with progress_shown() as progress:
         made = write_ring_test(found.machine, target, settings, progress=progress)
     print_proof(made, found.warnings)
+    measured = all(stated_hz(axis) is None for axis in found.machine.axes.values())
+    then = f"verify {target.name} LOG" if measured else f"identify {target.name} LOG"
+    typer.echo(f"when it has run: stillpath {then} --machine {machine}")
 
 
 def motor_test(
