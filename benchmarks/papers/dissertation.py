@@ -321,6 +321,11 @@ def _sent(design: FullPreview, g: LiftedOperator, y_d: Array) -> tuple[float, fl
     return rms(e) / rms(y_d), rms(sent) / rms(y_d), about
 
 
+def table_43() -> Iterator[Row]:
+    """Five nominal models and two bases on thirty plants."""
+    yield from neighbour("table_4_3")
+
+
 def figure_i5() -> Iterator[Row]:
     """Robust nominal model in the frequency domain."""
     yield from neighbour("figure_i5")
@@ -352,6 +357,7 @@ SECTIONS: dict[str, Callable[[int, bool], Iterator[Row]]] = {
     "appendix-c": lambda *_: appendix_c(),
     "taz": lambda *_: taz(),
     "robust": lambda seeds, _: robust(seeds),
+    "table-4.3": lambda *_: table_43(),
     "appendix-h": lambda *_: appendix_h(),
     "cost": lambda _, quick: cost(quick),
     "figure-i5": lambda *_: figure_i5(),
