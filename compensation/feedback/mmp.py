@@ -147,7 +147,8 @@ def predictor(
         raise Refusal(
             "singular",
             f"tones {', '.join(f'{f:g}' for f in f_hz)} Hz cannot be told apart with a sensor at "
-            f"{1 / (ratio * dt_s):g} Hz (singular set, paper 001 (14)); change its rate",
+            f"{1 / (ratio * dt_s):g} Hz: two of them, or one and half its rate, look alike to it; "
+            "change its rate",
         )
     b = np.ones(1)
     for turn in w * ratio:
