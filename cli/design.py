@@ -58,7 +58,10 @@ def track(
     basis: BasisOption = DEFAULT_BASIS,
     functions: Annotated[
         int | None,
-        typer.Option(min=1, help="How many. [default: as many as the model's band holds]"),
+        typer.Option(
+            min=1,
+            help="How many. [default: half of the samples; bspline, dct: within the model's band]",
+        ),
     ] = None,
     nominal: Annotated[
         Literal["plant", "ensemble", "optimum", "frequency"],

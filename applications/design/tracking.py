@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import csv
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -36,6 +37,7 @@ the nominal model (4.28), or G_r (I.3) with its kernel distribution (I.5)."""
 MOST_SAMPLES = 3000
 """Matrices of so many rows take half a minute."""
 _DT_S = 1e-3
+_SLOW_FIRST = ("bspline", "dct")
 _AXES: tuple[Literal["x", "y"], ...] = ("x", "y")
 
 
@@ -90,8 +92,8 @@ def track(
     basis : str
         A name of `compensation.basis.BASES`.
     functions : int, optional
-        How many; by default as many as keep the command within the model's band, at most half of
-        the samples.
+        How many; by default half of the samples, of B-splines and cosines at most as many as keep
+        the command within the model's band.
     rest_s : float
         How long the axis is held at the end.
 
@@ -113,7 +115,7 @@ def track(
     if scale == 0.0:
         raise DesignError(f"the path stays at {path_mm[0]:g} mm: there is nothing to track")
     m = len(y_d)
-    n = functions if functions is not None else _in_band(band_hz, m)
+    n = functions if functions is not None else _count(basis, band_hz, m)
     design = _designed(plants, m, basis, n, nominal)
     u = design.command(y_d)
     controller = design.controller()
@@ -148,7 +150,8 @@ def read_path(file: Path, axis: str) -> Array:
         Naming file, line and value.
     """
     with file.open(encoding="utf-8", errors="replace", newline="") as lines:
-        rows = [row for row in csv.reader(lines) if row]
+        # Not more than a design takes: anything may be named here.
+        rows = list(islice((row for row in csv.reader(lines) if row), MOST_SAMPLES + 2))
     if not rows:
         raise DesignError(f"{file}: the file is empty; give one number a line, or a table")
     head, at = [cell.strip() for cell in rows[0]], 0
@@ -199,8 +202,11 @@ def _plants(machine: Machine, axis: str, basis: str, nominal: str) -> PlantSet:
     return plants
 
 
-def _in_band(band_hz: tuple[float, float] | None, m: int) -> int:
-    """Return how many functions stay within a band, at most half of the samples."""
+def _count(basis: str, band_hz: tuple[float, float] | None, m: int) -> int:
+    """Return how many functions to take if nobody says it."""
+    if basis not in _SLOW_FIRST:
+        # What the plant answers most comes first: slow motion may be behind a whole resonance.
+        return m // 2
     return max(1, min(m // 2, functions_within(band_hz, _DT_S) * m // 300))
 
 

@@ -64,6 +64,15 @@ def test_a_nominal_model_of_the_set_helps_its_worst_plant(nominal: str) -> None:
     assert np.mean(robust.members) < np.mean(plain.members)
 
 
+@pytest.mark.parametrize("basis", ["ce-opt", "robust", "bspline", "dct"])
+@pytest.mark.parametrize("machine", ["ender3", "voron-v0", "voron-v24-250", "annex-k3"])
+def test_the_default_number_holds_a_slow_path(machine: str, basis: str) -> None:
+    """What these plants answer most lies beside their resonance, which the path does not need."""
+    t = np.arange(300) * 1e-3
+    found = track(load_machine(machine), "x", 10 * (1 - np.cos(9 * t)), basis=basis)
+    assert max(found.members) < 0.02
+
+
 def test_optimum_and_robust_functions_are_the_robust_least_squares_of_the_set() -> None:
     """Docs/fbf.md: proposition 4.2 with (4.28) is ensemble least squares with robust functions."""
     machine, y = load_machine("ender3"), path(250)
