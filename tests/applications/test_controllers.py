@@ -335,6 +335,17 @@ def test_every_tone_may_have_a_band_of_its_own_or_none(
     )
 
 
+@pytest.mark.parametrize("index", [i for i, name in enumerate(IDS) if name != "fmsdob-adaptive"])
+def test_a_refusal_names_settings_that_the_method_has(index: int) -> None:
+    name, document = CASES[index]
+    options = read_options(document | {"uncertainty": 10})
+    with pytest.raises(DesignError) as told:
+        design_controller(load_loop(name), options)
+    named = re.findall(r"detuning|alpha|[a-z]+_[a-z]+", str(told.value).rpartition(";")[2])
+    assert named
+    assert set(named) <= set(type(options).model_fields)
+
+
 def test_a_document_keeps_a_null_that_is_not_the_default() -> None:
     """Else the same options would make another controller: alpha 0.95 in place of the fastest."""
     name, document = CASES[4]
