@@ -35,7 +35,7 @@ Nominal = Literal["plant", "ensemble", "optimum", "frequency"]
 """What functions are filtered through: the nominal plant, every plant of the set (least squares),
 the nominal model (4.28), or G_r (I.3) with its kernel distribution (I.5)."""
 MOST_SAMPLES = 3000
-"""Matrices of so many rows take half a minute."""
+"""Robust functions of so many take a minute and 1 GB."""
 _DT_S = 1e-3
 _SLOW_FIRST = ("bspline", "dct")
 _AXES: tuple[Literal["x", "y"], ...] = ("x", "y")
