@@ -49,7 +49,7 @@ class SettingOptions:
     targets_hz: Annotated[str | None, typer.Option(help=f"Tones: {_MANY}")] = None
     bandwidth_hz: Annotated[
         str | None,
-        typer.Option(help="Width of each notch. fmsdob: also one for each tone, or none."),
+        typer.Option(help="Width of the notches. fmsdob, mmp: or one each. fmsdob: or none."),
     ] = None
     shape: Annotated[str | None, typer.Option(help="pointwise or hermite.")] = None
     detuning: Annotated[float | None, typer.Option(help="Notches end at 1 - detuning.")] = None

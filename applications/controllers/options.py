@@ -141,6 +141,8 @@ class MmpOptions(_Options):
 
     Attributes
     ----------
+    bandwidth_hz : float or sequence of float
+        Width of each notch, one for all tones or one for each.
     alpha : float or None
         Pole radius of the predictor per slow sample; None: the fastest within `noise_gain`.
     noise_gain : float
@@ -149,7 +151,7 @@ class MmpOptions(_Options):
 
     method: Literal["mmp"]
     targets_hz: Targets
-    bandwidth_hz: Frequency = 10.0
+    bandwidth_hz: Widths = 10.0
     alpha: Annotated[float, Field(ge=0, lt=1)] | None = 0.95
     shape: Shape = "pointwise"
     noise_gain: Annotated[float, Field(gt=0, le=100)] = 2.0

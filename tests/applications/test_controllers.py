@@ -335,6 +335,25 @@ def test_every_tone_may_have_a_band_of_its_own_or_none(
     )
 
 
+def test_the_tones_of_a_slow_sensor_may_have_bands_of_their_own(tmp_path: Path) -> None:
+    """Paper 001, theorem 1: a width for each tone; the wide one settles sooner."""
+    file = tmp_path / "c.json"
+    asked = ["controller", "-m", "galvo-camera", "--method", "mmp", "--json", str(file)]
+    assert run([*asked, "--targets-hz", "500,2000", "--bandwidth-hz", "2,40"]) == 0
+    loaded = load_controller(file)
+    assert loaded.options == read_options(
+        {"method": "mmp", "targets_hz": [500, 2000], "bandwidth_hz": [2, 40]}
+    )
+    loop = load_loop("galvo-camera")
+    t = np.arange(2000) * loop.loop.dt_s
+    left = []
+    for f_hz in (500, 2000):
+        d = {"d_out": np.sin(2 * np.pi * f_hz * t)}
+        y = simulate(loop.nominal(), loaded.blocks, d, sensor=loop.sensor)["y"]
+        left.append(np.abs(y[-200:]).max())
+    assert left[1] < 1e-3 < 0.1 < left[0]
+
+
 @pytest.mark.parametrize("index", [i for i, name in enumerate(IDS) if name != "fmsdob-adaptive"])
 def test_a_refusal_names_settings_that_the_method_has(index: int) -> None:
     name, document = CASES[index]
