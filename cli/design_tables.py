@@ -21,7 +21,8 @@ def print_design(report: DesignReport) -> None:
         console.print(_members(report))
     _lifted(report, console)
     console.print(_ladder(report))
-    for refused in filter(None, (rung.refused for rung in report.ladder)):
+    # Rungs may all be refused for one reason.
+    for refused in dict.fromkeys(rung.refused for rung in report.ladder if rung.refused):
         console.print(f"refused: {refused}", markup=False)
     own, rung = summary.own, summary.rung
     if own is not None and rung is not None and report.accel_limit_mm_s2 is not None:
