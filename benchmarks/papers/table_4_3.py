@@ -9,8 +9,8 @@ The robust functions (4.22) are the directions in which plants differ least, whe
 a set that is known up to half the sampling rate that is far above the path, which then is not
 followed at all: shown in a row of its own. Measured responses end at some frequency; in the other
 rows inputs are limited to the path's, by 248 cosines (F.1) from 0 to 50 Hz. That limit is ours, and
-counts: with 60 Hz deviations fall twice as far, and robust functions have the larger mean with every
-model. So order and size of the ratios are comparable, not their digits.
+counts: with 60 Hz deviations fall twice as far, and robust functions have the larger mean with
+every model. Comparable is that the deviation falls, and most with both steps; not the digits.
 """
 
 from __future__ import annotations
