@@ -32,6 +32,7 @@ SettingsFile = Annotated[
     ),
 ]
 _MANY = "Hz, separated by commas."
+_NO_BAND_PASS = "none"
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +47,10 @@ class SettingOptions:
         ),
     ] = None
     targets_hz: Annotated[str | None, typer.Option(help=f"Tones: {_MANY}")] = None
-    bandwidth_hz: Annotated[float | None, typer.Option(help="Width of each notch.")] = None
+    bandwidth_hz: Annotated[
+        str | None,
+        typer.Option(help="Width of the notches. fmsdob, mmp: or one each. fmsdob: or none."),
+    ] = None
     shape: Annotated[str | None, typer.Option(help="pointwise or hermite.")] = None
     detuning: Annotated[float | None, typer.Option(help="Notches end at 1 - detuning.")] = None
     tones: Annotated[int | None, typer.Option(help="fmsdob-adaptive: how many.")] = None
@@ -71,11 +75,13 @@ class SettingOptions:
         """Return the settings that were given, numbers and machines read."""
         given = asdict(self) | {
             "targets_hz": _numbers("--targets-hz", self.targets_hz),
+            "bandwidth_hz": _widths(self.bandwidth_hz),
             "nominal": _reference(self.nominal),
             "notches_hz": _numbers("--notches-hz", self.notches_hz),
             "fast": _reference(self.fast),
         }
-        return {name: value for name, value in given.items() if value is not None}
+        chosen = {name: value for name, value in given.items() if value is not None}
+        return chosen | ({"bandwidth_hz": None} if self.bandwidth_hz == _NO_BAND_PASS else {})
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,6 +178,13 @@ def _numbers(option: str, text: str | None) -> list[float] | None:
         return [float(part) for part in text.split(",") if part.strip()]
     except ValueError:
         raise typer.BadParameter(f"{option} {text}: numbers are needed, as in 500,1200") from None
+
+
+def _widths(text: str | None) -> list[float] | float | None:
+    if text == _NO_BAND_PASS:
+        return None
+    widths = _numbers("--bandwidth-hz", text)
+    return widths[0] if widths is not None and len(widths) == 1 else widths
 
 
 def _reference(name: str | None) -> object:

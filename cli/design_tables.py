@@ -1,4 +1,4 @@
-"""Terminal output of `stillpath design`."""
+"""Terminal output of `stillpath design` and `stillpath track`."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from rich.table import Table
 
 from stillpath.applications.design.figures import DesignReport
 from stillpath.applications.design.summary import Summary, modes_text, zero_text
+from stillpath.applications.design.tracking import Tracked
 
-__all__ = ["print_design"]
+__all__ = ["print_design", "print_tracked"]
 
 
 def print_design(report: DesignReport) -> None:
@@ -20,7 +21,8 @@ def print_design(report: DesignReport) -> None:
         console.print(_members(report))
     _lifted(report, console)
     console.print(_ladder(report))
-    for refused in filter(None, (rung.refused for rung in report.ladder)):
+    # Rungs may all be refused for one reason.
+    for refused in dict.fromkeys(rung.refused for rung in report.ladder if rung.refused):
         console.print(f"refused: {refused}", markup=False)
     own, rung = summary.own, summary.rung
     if own is not None and rung is not None and report.accel_limit_mm_s2 is not None:
@@ -33,6 +35,26 @@ def print_design(report: DesignReport) -> None:
     console.print(_robustness(report, summary))
     for reason in report.robustness.missing:
         console.print(f"missing: {reason}", markup=False)
+
+
+def print_tracked(tracked: Tracked) -> None:
+    """Print what the command reaches on the nominal plant and on the set, and what it takes."""
+    console = Console(highlight=False)
+    report, members = tracked.report, tracked.members
+    console.print(
+        f"{report.functions} functions of {len(tracked.path_mm)} samples, rank {report.rank}, "
+        f"condition {report.condition:.1e}"
+    )
+    table = Table("e/y_d", "plant", box=None, pad_edge=False)
+    table.add_row(f"{tracked.error:.3g}", "nominal")
+    if len(members) > 1:
+        table.add_row(f"{sum(members) / len(members):.3g}", f"mean of the set of {len(members)}")
+        table.add_row(f"{max(members):.3g}", "worst of the set")
+    console.print(table)
+    console.print(
+        f"u/y_d {tracked.effort:.3g}; largest command {tracked.largest_mm:.4g} mm\n"
+        f"J_e {tracked.j_e:.4f}, J_e,r {tracked.j_er:.4f}, J_c {tracked.j_c:.3g}"
+    )
 
 
 def _axis(report: DesignReport, console: Console) -> None:

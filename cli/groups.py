@@ -12,7 +12,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "Print": ("compensate", "simulate", "batch", "watch", "remove-advice", "jobs"),
     "Machine": ("machines", "identify", "ring-test", "coupon", "tower", "motor-test", "verify"),
     "Inside Klipper": ("klipper",),
-    "Research": ("plan", "trajectories", "design", "loops", "controller", "scan"),
+    "Research": ("plan", "trajectories", "design", "track", "loops", "controller", "scan"),
     "Server": (
         *("serve", "scheduler", "worker", "keys", "audit", "printers"),
         *("backup", "restore", "migrate", "warm"),

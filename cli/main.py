@@ -171,7 +171,7 @@ for _command in (
     *(batch.batch, batch.watch),
     *(compensate.compensate, compensate.simulate),
     *(controllers.controller, controllers.loops),
-    design.design,
+    *(design.design, design.track),
     identify.identify,
     keys.audit,
     *(proof.coupon, proof.tower, proof.ring_test, proof.motor_test, proof.verify),

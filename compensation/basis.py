@@ -279,7 +279,7 @@ def _per_input(members: LiftedSet, n: int, functions: Callable[[int, int], Array
 
 def _check(n: int, window: int) -> None:
     if not 1 <= n <= window:
-        raise DesignError(f"n = {n} basis functions in a window of {window} samples: 1 <= n needed")
+        raise DesignError(f"n = {n} basis functions of {window} samples: take 1 to {window}")
 
 
 BASES: dict[str, Basis] = {

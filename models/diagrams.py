@@ -246,7 +246,7 @@ class Running:
             Same outputs, wires, orders and delays as before.
         reset : bool
             Set the states of these blocks to 0. Otherwise a filter keeps the states of its former
-            coefficients, which is right only for small changes (finding 1f of the reference).
+            coefficients, which is right only for small changes.
 
         Raises
         ------

@@ -310,5 +310,15 @@ def _document(
         "every": round(nominal.dt_s / controller.dt_s),
         "unit": spec.unit,
         "loop": spec.model_dump(mode="json", exclude_none=True),
-        "options": options.model_dump(mode="json", exclude_none=True, exclude={"loop"}),
+        "options": _written(options),
+    }
+
+
+def _written(options: ControllerOptions) -> dict[str, object]:
+    """Return options as a document; null only where leaving out would mean something else."""
+    written = options.model_dump(mode="json", exclude_none=True, exclude={"loop"})
+    return written | {
+        name: None
+        for name, field in type(options).model_fields.items()
+        if getattr(options, name) is None and field.default is not None
     }

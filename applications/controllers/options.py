@@ -9,7 +9,7 @@ import re
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import Discriminator, Field, Tag, TypeAdapter, ValidationError
 
 from stillpath.compensation.base import DesignError
 from stillpath.models.complaints import complaint
@@ -36,6 +36,10 @@ __all__ = [
 
 Frequency = Annotated[float, Field(ge=1e-3, le=1e6, allow_inf_nan=False)]
 Targets = Annotated[tuple[Frequency, ...], Field(min_length=1, max_length=8)]
+Widths = Annotated[
+    Annotated[Frequency, Tag("one-width")] | Annotated[Targets, Tag("width-of-each")],
+    Discriminator(lambda v: "width-of-each" if isinstance(v, list | tuple) else "one-width"),
+]
 Shape = Literal["pointwise", "hermite"]
 LoopName = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]*$", max_length=64)]
 LoopReference = LoopName | LoopSpec
@@ -72,15 +76,15 @@ class FmsdobOptions(_Options):
 
     Attributes
     ----------
-    bandwidth_hz : float or None
-        -3 dB width of the band pass at each target; None leaves it out.
+    bandwidth_hz : float, sequence of float, or None
+        -3 dB width of the band pass, one for all targets or one for each; None leaves it out.
     zeros : sequence of (radius, Hz)
         Fixed zeros of Q.
     """
 
     method: Literal["fmsdob"]
     targets_hz: Targets
-    bandwidth_hz: Frequency | None = 50.0
+    bandwidth_hz: Widths | None = 50.0
     shape: Shape = "pointwise"
     detuning: Annotated[float, Field(gt=0, le=1)] = 1.0
     zeros: Annotated[
@@ -137,6 +141,8 @@ class MmpOptions(_Options):
 
     Attributes
     ----------
+    bandwidth_hz : float or sequence of float
+        Width of each notch, one for all tones or one for each.
     alpha : float or None
         Pole radius of the predictor per slow sample; None: the fastest within `noise_gain`.
     noise_gain : float
@@ -145,7 +151,7 @@ class MmpOptions(_Options):
 
     method: Literal["mmp"]
     targets_hz: Targets
-    bandwidth_hz: Frequency = 10.0
+    bandwidth_hz: Widths = 10.0
     alpha: Annotated[float, Field(ge=0, lt=1)] | None = 0.95
     shape: Shape = "pointwise"
     noise_gain: Annotated[float, Field(gt=0, le=100)] = 2.0
@@ -236,7 +242,9 @@ def read_options(document: Mapping[str, Any]) -> ControllerOptions:
             raise DesignError(
                 f"unknown method {method!r}; there are {', '.join(METHODS)}"
             ) from None
-        where = ".".join(str(part) for part in first["loc"][1:])
+        # Without the names of types, which a setting that may be one or another has in its place.
+        parts = (str(part) for part in first["loc"][1:])
+        where = ".".join(part for part in parts if re.fullmatch("[a-z0-9_]+", part))
         if first["type"] == "missing":
             raise DesignError(f"{method} needs {where}") from None
         if first["type"] == "extra_forbidden":

@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterator
 
 import numpy as np
-from feedback_records import Row, checked, rate, shown
+from feedback_records import Row, checked, derived, rate, shown, stated
 
 from stillpath.compensation.feedback.controller import Refusal
 from stillpath.compensation.feedback.multirate import (
@@ -63,15 +63,16 @@ def notches() -> Iterator[Row]:
     """Figure 9 and section 4.2."""
     for alpha, paper in ((0.99, -1.7), (0.8, -13.0)):
         left = 1 - InternalModel(13, alpha).response(angle(HARMONICS[:1]))[0]
-        yield checked(f"|1 - z^-m Q| at 1200 Hz, N = 13, a = {alpha}", paper, db(abs(left)), 0.25,
-                      "needs n0 = 3 (printed for tables, not here)", "dB")  # fmt: skip
+        yield checked(f"abs(1 - z^-m Q) at 1200 Hz, N = 13, a = {alpha}", paper, db(abs(left)),
+                      0.25, "needs n0 = 3 (printed for tables, not here)", "dB")  # fmt: skip
     rates = fast_rate(16_000, 1200)
-    yield checked("lcm of 16 kHz and 1200 Hz, kHz", 48, rates.rate_hz / 1e3, 0)
+    yield checked("lcm of 16 kHz and 1200 Hz", 48, rates.rate_hz / 1e3, 0, unit="kHz")
     try:
         fast_rate(16_000, 1199)
     except Refusal as refusal:
         yield shown("lcm of 16 kHz and 1199 Hz", "1918.4 kHz", "19184 kHz",
-                    f"the print is off by 10; refused ({refusal.reason})")  # fmt: skip
+                    f"the print is off by 10; refused ({refusal.reason})",
+                    "print error")  # fmt: skip
 
 
 def residuals() -> Iterator[Row]:
@@ -84,19 +85,28 @@ def residuals() -> Iterator[Row]:
     ):
         value = three_sigma(SLOW, plug_in_factor(model.response(angle(HARMONICS))))
         yield checked(f"3 sigma, {name}", paper, value, tolerance, why)
-        yield checked(f"  cut, {name}", cut, 100 * (1 - value / baseline), 3, unit="%")
+        yield checked(f"cut, {name}", cut, 100 * (1 - value / baseline), 3, unit="%")
     value = three_sigma(SLOW, multirate_factor(SLOW, MULTI, FAST, 3, HARMONICS))
     yield checked("3 sigma, multirate", 0.0053, value, 5e-5)
-    yield checked("  cut, multirate", 64, 100 * (1 - value / baseline), 0.5, unit="%")
+    yield checked("cut, multirate", 64, 100 * (1 - value / baseline), 0.5, unit="%")
     left = np.abs(SLOW.s0(HARMONICS) * multirate_factor(SLOW, MULTI, FAST, 3, HARMONICS))
-    yield shown("  S at 1200 .. 6000 Hz, multirate", "-", " ".join(f"{db(x):.1f}" for x in left),
+    yield from at_the_bed(baseline, value)
+    yield shown("S at 1200 .. 6000 Hz, multirate", None, " ".join(f"{db(x):.1f}" for x in left),
                 "dB: what is left is the low-pass, not transients")  # fmt: skip
     value = three_sigma(SLOW, multirate_factor(SLOW, BARE, FAST, 3, HARMONICS))
-    yield shown("  3 sigma, multirate without low-pass", "-", f"{value:.1e}", "")
+    yield shown("3 sigma, multirate without low-pass", None, f"{value:.1e}")
     made = design_multirate((SLOW,), FAST, 1200.0)
     y = simulate(SLOW, made.blocks, {"d_in": disturbance(3, 48_000)}, every=3)["y"][::3][-4000:]
     yield checked("3 sigma, multirate, time domain", 0.0053, 3 * float(y.std()), 5e-5,
-                  "inverse with zeros pulled to .97: the exact one rings at 19.7 kHz")  # fmt: skip
+                  "inverse with zeros pulled to 0.97: the exact one rings at 19.7 kHz")  # fmt: skip
+
+
+def at_the_bed(baseline: float, multirate: float) -> Iterator[Row]:
+    """Figure 21: the laser's error on the powder, 1 m below the mirrors; 4 mV are 0.006 degrees."""
+    error_mm = 1e3 * math.tan(math.radians(2 * 0.006))
+    yield checked("error on the bed, baseline", 0.21, error_mm, 0.005, unit="mm")
+    left_mm = error_mm * multirate / baseline
+    yield checked("error on the bed, multirate", 0.075, left_mm, 0.001, unit="mm")
 
 
 def margins() -> Iterator[Row]:
@@ -111,26 +121,32 @@ def margins() -> Iterator[Row]:
             -5.25,
             1404,
             0.25,
-            "the frequency is not reproduced: with N = 13 no alpha puts -5.25 dB there",
+            "",
         ),
     ):
         value, where = smallest(factor, GRID)
-        yield checked(f"min 1/|T|, {name}", paper, value, tolerance, why, "dB")
-        near = abs(where - at) <= 1
-        yield shown("  at", f"{at} Hz", f"{where:.0f} Hz", "same" if near else "NOT reproduced")
+        yield checked(f"min 1/abs(T), {name}", paper, value, tolerance, why, "dB")
+        what = f"frequency of min 1/abs(T), {name}"
+        if name == "wide-band":
+            yield shown(what, f"{at} Hz", f"{where:.0f} Hz",
+                        "with N = 13 no alpha and no low-pass gives -5.25 dB there: the peak is "
+                        "near 1404 Hz only for alpha 0.94, at -2.7 to -3.9 dB",
+                        "not reproduced")  # fmt: skip
+        else:
+            yield checked(what, at, where, 1, unit="Hz")
     fine = np.arange(4790.0, 4810.0, 1e-3) + 1e-5
     value, where = smallest(multirate_factor(SLOW, BARE, FAST, 3, fine), fine)
-    yield shown("  no low-pass, at every mHz", "-", f"{value:.2f} dB @{where:.2f}",
+    yield shown("min 1/abs(T), multirate, no low-pass, at every mHz", None,
+                f"{value:.2f} dB @{where:.2f}",
                 "between whole Hz it is worse than printed")  # fmt: skip
-    for name, model, f_hz in (("quasi", QUASI, 400.0 * np.arange(1, 20)),):
-        value = instant_margin(SLOW, model, f_hz).db
-        yield checked(f"closed form of min 1/|T|, {name}", -2.15, value, 0.06, "against our sweep",
-                      "dB")  # fmt: skip
+    swept, _ = smallest(plug(QUASI), GRID)
+    value = instant_margin(SLOW, QUASI, 400.0 * np.arange(1, 20)).db
+    yield derived("closed form of min 1/abs(T), quasi", swept, value, 0.06, "our sweep", "dB")
     f_hz = np.arange(10.0, 8000.0)
     t0 = np.abs(SLOW.t0(f_hz))
     yield shown("bandwidth of T0", "4400 Hz", f"{f_hz[t0 < math.sqrt(0.5)][0]:.0f} Hz",
                 f"{f_hz[t0 < math.sqrt(0.5) * t0[0]][0]:.0f} Hz relative to its gain at 0; the "
-                "decimals of the print do not give more")  # fmt: skip
+                "decimals of the print do not give more", "not reproduced")  # fmt: skip
 
 
 def second_filter() -> Iterator[Row]:
@@ -144,20 +160,21 @@ def second_filter() -> Iterator[Row]:
     ]
     # G_1 at f is G_0 at f - 16 kHz: the conjugate at 16 kHz - f, and G_2 alike.
     gap = np.max(np.abs(sum(images) / 3 / mean - 1))
-    yield checked("G against the mean of G_0 G_1 G_2, relative", 0.0, float(gap), 1e-9)
-    for name, model, said in (("first", MULTI, "spikes"), ("second", SECOND, "no visible")):
+    yield checked("(14): G less the mean of G_0 G_1 G_2, relative", 0.0, float(gap), 1e-9)
+    for name, model, said in (("first", MULTI, "spikes"), ("second", SECOND, "none visible")):
         factor = np.abs(multi(model))
         worst = int(np.argmax(factor))
-        yield shown(f"worst amplification, {name} Q", said,
-                    f"{db(factor[worst]):.2f} dB @{GRID[worst]:.0f}",
-                    "S over S of the baseline")  # fmt: skip
+        most = db(factor[worst])
+        yield stated(f"worst amplification, {name} Q", said, f"{most:.2f} dB @{GRID[worst]:.0f}",
+                     most > 1 if said == "spikes" else most < 0.5,
+                     "S over S of the baseline")  # fmt: skip
     value = three_sigma(SLOW, multirate_factor(SLOW, SECOND, FAST, 3, HARMONICS))
-    yield shown("3 sigma, multirate, second Q", "-", f"{value:.4f}",
+    yield shown("3 sigma, multirate, second Q", None, f"{value:.4f}",
                 "worse than table 1: do not mix the two sets of numbers")  # fmt: skip
 
 
 def plant_errors() -> Iterator[Row]:
-    """Steady state on plants that differ; reference, not the paper."""
+    """Steady state on plants that differ, which the paper has not, against other sums of it."""
     for name, gain, delay, said in (
         ("gain +10 %", 1.1, 0.0, (0.0107, 0.0056, 0.0165)),
         ("gain -20 %", 0.8, 0.0, (0.0075, 0.0045, 0.0115)),
@@ -178,7 +195,7 @@ def plant_errors() -> Iterator[Row]:
             ("quasi", "multirate", "baseline"), said, values, strict=True
         ):
             value = 3 * periodic_residual(baseline, factor, VOLTS)
-            yield checked(f"3 sigma, {name}, {method}", reference, value, 2e-4, "reference's")
+            yield derived(f"3 sigma, {name}, {method}", reference, value, 2e-4)
 
 
 def loadable() -> Iterator[Row]:
@@ -190,15 +207,15 @@ def loadable() -> Iterator[Row]:
         design_quasi(loops, 1200.0),
         design_multirate(loops, fast, 1200.0),
     ):
-        yield shown(f"{made.method}: min 1/|T|, largest |1 - PQ|, noise gain", "-",
+        yield shown(f"{made.method}: min 1/abs(T), largest abs(1 - PQ), noise gain", None,
                     f"{made.prediction.min_inverse_t.db:.2f} dB, "
                     f"{made.prediction.max_add_on.db:.2f} dB, {made.noise_gain:.2f}",
-                    f"{made.multiplications:.0f} multiplications a tick; largest |z| of all plants "
-                    f"{max(made.spectral_radii):.6f}")  # fmt: skip
+                    f"{made.multiplications:.0f} multiplications a tick; largest abs(z) of all "
+                    f"plants {max(made.spectral_radii):.6f}")  # fmt: skip
     made = design_quasi(loops, 1200.0)
     drive = disturbance(1, 1_000_000)
     loop = ClosedLoop(loops[0], made.blocks)
-    yield shown("simulation of the quasi loop", ">= 1 (issue)",
+    yield shown("simulation of the quasi loop", None,
                 rate(lambda: loop.push({"d_in": drive}), len(drive)),
                 "memory of 43 samples")  # fmt: skip
 

@@ -1,12 +1,29 @@
-"""What the feedback scripts of this folder share: rows with a tolerance and a verdict."""
+"""What the feedback scripts of this folder share: rows, each with its verdict."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
 
-Row = tuple[str, str, str, str]
-"""Quantity, the paper's value, ours, tolerance with verdict and reason."""
+Verdict = Literal[
+    "within its tolerance", "MISS", "as derived", "fitted", "not reproduced", "print error", "shown"
+]
+"""Of a published number: within its tolerance or not, a free number was fitted to it, it does not
+come out, or it is printed wrongly. Of others: equal to what follows by other means, or only shown.
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One line: `published` is what the paper prints, and None if it prints nothing."""
+
+    quantity: str
+    published: str | None
+    ours: str
+    verdict: Verdict
+    remark: str = ""
 
 
 def checked(
@@ -14,23 +31,41 @@ def checked(
     paper: float,
     ours: float,
     tolerance: float,
-    reason: str = "",
+    remark: str = "",
     unit: str = "",
     digits: str = ".4g",
 ) -> Row:
-    """A row whose verdict is whether both values lie within the tolerance."""
-    verdict = "yes" if abs(ours - paper) <= tolerance else "NO"
-    return (
-        quantity,
-        f"{paper:{digits}} {unit}".strip(),
-        f"{ours:{digits}} {unit}".strip(),
-        f"within {tolerance:g}: {verdict}" + (f"; {reason}" if reason else ""),
-    )
+    """A published number against ours."""
+    verdict: Verdict = "within its tolerance" if abs(ours - paper) <= tolerance else "MISS"
+    said, found = (f"{value:{digits}} {unit}".strip() for value in (paper, ours))
+    return Row(quantity, said, found, verdict, _joined(f"within {tolerance:g}", remark))
 
 
-def shown(quantity: str, paper: str, ours: str, reason: str) -> Row:
-    """A row that cannot be judged, with the reason."""
-    return quantity, paper, ours, reason
+def derived(
+    quantity: str,
+    expected: float,
+    ours: float,
+    tolerance: float,
+    remark: str = "",
+    unit: str = "",
+    digits: str = ".4g",
+) -> Row:
+    """A number that the paper does not print, against what it must be by other means."""
+    verdict: Verdict = "as derived" if abs(ours - expected) <= tolerance else "MISS"
+    wanted, found = (f"{value:{digits}} {unit}".strip() for value in (expected, ours))
+    return Row(quantity, None, found, verdict, _joined(f"{wanted} within {tolerance:g}", remark))
+
+
+def stated(quantity: str, published: str, ours: str, holds: bool, remark: str = "") -> Row:
+    """What the paper says without a number of its own, or with "about", and whether it holds."""
+    return Row(quantity, published, ours, "within its tolerance" if holds else "MISS", remark)
+
+
+def shown(
+    quantity: str, published: str | None, ours: str, remark: str = "", verdict: Verdict = "shown"
+) -> Row:
+    """A row without a tolerance, and why."""
+    return Row(quantity, published, ours, verdict, remark)
 
 
 def rate(run: Callable[[], object], samples: int) -> str:
@@ -42,3 +77,7 @@ def rate(run: Callable[[], object], samples: int) -> str:
         run()
         took.append(time.perf_counter() - start)
     return f"{samples / min(took) / 1e6:.1f} million samples/s"
+
+
+def _joined(*parts: str) -> str:
+    return "; ".join(part for part in parts if part)

@@ -59,7 +59,7 @@ def rows(realisations: int = REALISATIONS, seed: int = 1) -> list[Row]:
     names: list[Distribution] = ["kernel", "uniform", "sampled"]
     robust = {name: robust_nominal(plants, distribution=name, points=POINTS) for name in names}
     rng = np.random.default_rng(seed)
-    y_d = path(rng)
+    y_d = even_path(rng, SAMPLES)
     commands = [command(lift(plant, SAMPLES + RUN_OUT), y_d) for plant in plants]
     for run_out in (RUN_OUT, 0):
         commands += [command(robust[n].operator(SAMPLES + run_out), y_d) for n in names]
@@ -90,18 +90,22 @@ def rows(realisations: int = REALISATIONS, seed: int = 1) -> list[Row]:
 
 def x_axis() -> list[DiscretePlant]:
     """The axis at sixteen accelerations, the smallest first."""
+    return scaled_axes(np.linspace(1.0, -1.0, len(ACCELERATIONS)))
+
+
+def scaled_axes(places: Array) -> list[DiscretePlant]:
+    """The axis between its extremes, -1 .. 1: frequency and damping."""
     nominal = load_machine("taz6-x").axes["x"].nominal
-    place = np.linspace(1.0, -1.0, len(ACCELERATIONS))
-    scaled = [nominal.scaled(1 + FREQUENCY_SPREAD * p, DAMPING_SPREAD**-p) for p in place]
+    scaled = [nominal.scaled(1 + FREQUENCY_SPREAD * p, DAMPING_SPREAD**-p) for p in places]
     listed = tuple(WeightedMember.model_validate({"plant": s.model_dump()}) for s in scaled)
     return list(plant_set(PlantSetSpec(nominal=nominal, members=listed), DT_S).members)
 
 
-def path(rng: np.random.Generator) -> Array:
+def even_path(rng: np.random.Generator, samples: int) -> Array:
     """Even spectrum and random phases within the band, at rest at both ends; RMS 1."""
-    f_hz = np.fft.rfftfreq(SAMPLES, DT_S)
+    f_hz = np.fft.rfftfreq(samples, DT_S)
     inside = (f_hz >= BAND_HZ[0]) & (f_hz <= BAND_HZ[1])
-    y_d = irfft(inside * np.exp(2j * np.pi * rng.uniform(size=len(f_hz))), SAMPLES)
+    y_d = irfft(inside * np.exp(2j * np.pi * rng.uniform(size=len(f_hz))), samples)
     rise = 0.5 - 0.5 * np.cos(np.pi * np.arange(50) / 50)
     y_d[:50] *= rise
     y_d[-50:] *= rise[::-1]

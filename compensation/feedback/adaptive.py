@@ -1,9 +1,9 @@
 """Identify tones of unknown, jumping frequency, and retune the observer to follow them.
 
 A notch A(z)/A(rho z) with mirror-symmetric A is fitted to the disturbance estimate by recursive
-least squares. To lock on the right frequency (finding 1g of the reference), covariance and data are
-reset after every jump, and the notch starts wide (rho .3) with a short memory (lambda .9) before it
-narrows (.98, .995). Started at rho = .9 it locked 1 kHz off.
+least squares. To lock on the right frequency, covariance and data are reset after every jump, and
+the notch starts wide (rho .3) with a short memory (lambda .9) before it narrows (.98, .995).
+Started at rho = .9 it locked 1 kHz off.
 """
 
 from __future__ import annotations

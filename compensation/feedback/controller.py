@@ -36,6 +36,18 @@ Uncertainty = float | Callable[[Array], Array]
 """Bound of the relative plant error |Delta(f)|: one number, or a function of the frequencies."""
 _BEST_KNOWN = 1e-4
 """Least accepted bound: below it, rounding alone would decide whether a loop is stable."""
+_NARROWER = "lower bandwidth_hz, drop the target where the plant is least known"
+_QUIETER = "raise nyquist_pairs, name in notches_hz where the plant is least known"
+_REMEDIES = {
+    "fmsdob": f"lower detuning, {_NARROWER}",
+    "inverse-dob": _NARROWER,
+    "mmp": _NARROWER,
+    "dob": "lower cutoff_hz",
+    "rc-wide": f"raise alpha, {_QUIETER}",
+    "rc-quasi": _QUIETER,
+    "rc-multirate": _QUIETER,
+}
+"""What to change in the settings of a method whose loop would be unstable, or too near to it."""
 
 
 class Refusal(DesignError):
@@ -223,7 +235,7 @@ class Controller:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Design:
-    """An add-on before it is checked.
+    """An add-on before it is checked; for its method there must be a remedy in `_REMEDIES`.
 
     Attributes
     ----------
@@ -274,7 +286,7 @@ def judged(
             raise Refusal(
                 "unstable",
                 f"{method} on {loop.name!r}: not internally stable, largest |z| = {radius:.8f}; "
-                "detune, drop the targets where the plant is least known, or identify it better",
+                f"{_REMEDIES[method]}, or identify it better",
             )
         radii.append(radius)
     noise_gain = design.noise_gain
@@ -329,8 +341,8 @@ def _check_small_gain(method: str, prediction: Prediction, uncertainty: Uncertai
         raise Refusal(
             "small gain",
             f"{method}: the plant {off} {bound[worst]:.3g}, at {f[worst]:.5g} Hz the "
-            f"loop allows 1/|T| = {1 / t[worst]:.3g}; narrow the band, "
-            "detune, drop that target, or identify the plant better",
+            f"loop allows 1/|T| = {1 / t[worst]:.3g}; "
+            f"{_REMEDIES[method]}, or identify the plant better",
             float(f[worst]),
         )
 

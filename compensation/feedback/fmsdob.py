@@ -42,6 +42,7 @@ __all__ = [
     "Shape",
     "Trim",
     "add_on_blocks",
+    "band_widths",
     "design_q",
     "fmsdob",
     "forward_model",
@@ -167,7 +168,7 @@ def fmsdob(
     q = design_q(
         nominal, targets_hz, shape=shape, bandwidth_hz=bandwidth_hz, trim=trim, around=around
     )
-    asked = _widths(bandwidth_hz, len(targets_hz))
+    asked = band_widths(bandwidth_hz, len(targets_hz))
     f = frequency_grid(nominal.dt_s, targets_hz, asked or (0.01 / nominal.dt_s,) * len(targets_hz))
     least = instant_check(nominal, targets_hz)
     design = Design(
@@ -220,7 +221,7 @@ def design_q(
     if not 0.0 < trim.detuning <= 1.0:
         raise DesignError(f"detuning {trim.detuning:g}: take a factor in (0, 1]")
     values, slopes = inverse_and_slope(*forward_model(loop, around), w)
-    widths = _widths(bandwidth_hz, len(w))
+    widths = band_widths(bandwidth_hz, len(w))
     band = LatticeBandPass.at(tuple(map(float, targets_hz)), widths, loop.dt_s) if widths else None
     if trim.through_band and band is not None:
         slopes = slopes - values * np.array([band.slope(i) for i in range(len(w))])
@@ -288,7 +289,8 @@ def model_blocks(loop: Loop, around: Around = "servo") -> tuple[Block, ...]:
     )
 
 
-def _widths(bandwidth_hz: float | Sequence[float] | None, count: int) -> tuple[float, ...]:
+def band_widths(bandwidth_hz: float | Sequence[float] | None, count: int) -> tuple[float, ...]:
+    """Return the width of each of `count` bands; () for no band pass."""
     if bandwidth_hz is None:
         return ()
     if isinstance(bandwidth_hz, Sequence):

@@ -26,7 +26,7 @@ from stillpath.compensation.feedback.controller import (
     frequency_grid,
     judged,
 )
-from stillpath.compensation.feedback.fmsdob import Shape, design_q, model_blocks
+from stillpath.compensation.feedback.fmsdob import Shape, band_widths, design_q, model_blocks
 from stillpath.models.arrays import Array, Complex
 from stillpath.models.diagrams import Block, polynomial_response
 from stillpath.models.disturbances import SensorSpec
@@ -147,7 +147,8 @@ def predictor(
         raise Refusal(
             "singular",
             f"tones {', '.join(f'{f:g}' for f in f_hz)} Hz cannot be told apart with a sensor at "
-            f"{1 / (ratio * dt_s):g} Hz (singular set, paper 001 (14)); change its rate",
+            f"{1 / (ratio * dt_s):g} Hz: two of them, or one and half its rate, look alike to it; "
+            "change its rate",
         )
     b = np.ones(1)
     for turn in w * ratio:
@@ -213,7 +214,7 @@ def mmp(
     sensor: SensorSpec,
     *,
     alpha: float | None = 0.95,
-    bandwidth_hz: float = 10.0,
+    bandwidth_hz: float | Sequence[float] = 10.0,
     shape: Shape = "pointwise",
     noise_gain: float = DEFAULT_NOISE_GAIN,
     uncertainty: Uncertainty | None = None,
@@ -228,6 +229,8 @@ def mmp(
         Its rate (`every` is L) and age.
     alpha : float or None
         Of the predictor; None: the fastest with at most `noise_gain`.
+    bandwidth_hz : float or sequence of float
+        -3 dB width of the band pass, of all tones or of each.
 
     Raises
     ------
@@ -239,7 +242,7 @@ def mmp(
     nominal = loops[0]
     made = _quiet_predictor(nominal, targets_hz, sensor, alpha, noise_gain)
     q = design_q(nominal, targets_hz, shape=shape, bandwidth_hz=bandwidth_hz)
-    f = frequency_grid(nominal.dt_s, targets_hz, (bandwidth_hz,) * len(targets_hz))
+    f = frequency_grid(nominal.dt_s, targets_hz, band_widths(bandwidth_hz, len(targets_hz)))
     add_on = 1.0 - nominal.servo(f) * q.response(2 * np.pi * f * nominal.dt_s) * made.response(f)
     distance = singular_distance_hz(targets_hz, sensor.every * nominal.dt_s)
     design = Design(
@@ -257,7 +260,7 @@ def mmp(
             "targets_hz": [float(t) for t in targets_hz],
             "ratio": sensor.every,
             "alpha": made.alpha,
-            "bandwidth_hz": bandwidth_hz,
+            "bandwidth_hz": _stored(bandwidth_hz),
             "shape": shape,
         },
         notes=(
@@ -267,6 +270,10 @@ def mmp(
         ),
     )
     return judged(design, loops, uncertainty)
+
+
+def _stored(bandwidth_hz: float | Sequence[float]) -> float | list[float]:
+    return list(bandwidth_hz) if isinstance(bandwidth_hz, Sequence) else bandwidth_hz
 
 
 def _quiet_predictor(

@@ -25,6 +25,7 @@ from stillpath.applications.controllers.page import render_controller, write_con
 from stillpath.applications.controllers.response import answer, disturbance_of
 from stillpath.cli.main import run
 from stillpath.compensation.base import DesignError
+from stillpath.compensation.feedback.fmsdob import fmsdob
 from stillpath.models.disturbances import sample
 from stillpath.models.errors import ModelError
 from stillpath.models.loops import LoopSpec, builtin_loops, load_loop
@@ -318,10 +319,80 @@ def test_the_command_writes_json_header_and_pages(
     assert pages == ["controller.h", "controller.html", "controller.json"]
 
 
+@pytest.mark.parametrize(("said", "widths"), [("300,500", (300.0, 500.0)), ("none", None)])
+def test_every_tone_may_have_a_band_of_its_own_or_none(
+    said: str, widths: tuple[float, float] | None, tmp_path: Path
+) -> None:
+    """Paper 000: B_w,i of (16); without a band pass, propositions 4 and 6 alone."""
+    file = tmp_path / "c.json"
+    asked = ["controller", "-m", "galvo-40khz", "--method", "fmsdob", "--json", str(file)]
+    assert run([*asked, "--targets-hz", "2000,7000", "--bandwidth-hz", said]) == 0
+    wanted = fmsdob(load_loop("galvo-40khz").loops(), (2000.0, 7000.0), bandwidth_hz=widths)
+    document = json.loads(file.read_text())
+    assert document["coefficients"] == json.loads(json.dumps(wanted.to_dict()))["coefficients"]
+    assert load_controller(file).options == read_options(
+        {"method": "fmsdob", "targets_hz": [2000, 7000], "bandwidth_hz": widths}
+    )
+
+
+def test_the_tones_of_a_slow_sensor_may_have_bands_of_their_own(tmp_path: Path) -> None:
+    """Paper 001, theorem 1: a width for each tone; the wide one settles sooner."""
+    file = tmp_path / "c.json"
+    asked = ["controller", "-m", "galvo-camera", "--method", "mmp", "--json", str(file)]
+    assert run([*asked, "--targets-hz", "500,2000", "--bandwidth-hz", "2,40"]) == 0
+    loaded = load_controller(file)
+    assert loaded.options == read_options(
+        {"method": "mmp", "targets_hz": [500, 2000], "bandwidth_hz": [2, 40]}
+    )
+    loop = load_loop("galvo-camera")
+    t = np.arange(2000) * loop.loop.dt_s
+    left = []
+    for f_hz in (500, 2000):
+        d = {"d_out": np.sin(2 * np.pi * f_hz * t)}
+        y = simulate(loop.nominal(), loaded.blocks, d, sensor=loop.sensor)["y"]
+        left.append(np.abs(y[-200:]).max())
+    assert left[1] < 1e-3 < 0.1 < left[0]
+
+
+@pytest.mark.parametrize("index", [i for i, name in enumerate(IDS) if name != "fmsdob-adaptive"])
+def test_a_refusal_names_settings_that_the_method_has(index: int) -> None:
+    name, document = CASES[index]
+    options = read_options(document | {"uncertainty": 10})
+    with pytest.raises(DesignError) as told:
+        design_controller(load_loop(name), options)
+    named = re.findall(r"detuning|alpha|[a-z]+_[a-z]+", str(told.value).rpartition(";")[2])
+    assert named
+    assert set(named) <= set(type(options).model_fields)
+
+
+def test_a_document_keeps_a_null_that_is_not_the_default() -> None:
+    """Else the same options would make another controller: alpha 0.95 in place of the fastest."""
+    name, document = CASES[4]
+    options = read_options(document | {"alpha": None})
+    written = design_controller(load_loop(name), options).report.controller
+    assert read_controller(json.dumps(written)).options == options
+    assert "uncertainty" not in written["options"]
+
+
+@pytest.mark.parametrize(
+    ("widths", "said"),
+    [
+        ("a", "fmsdob: bandwidth_hz: must be a number"),
+        ([40, 0], "fmsdob: bandwidth_hz.1: must be at least 0.001"),
+        ([], "fmsdob: bandwidth_hz: "),
+    ],
+)
+def test_a_wrong_width_is_told_where_it_stands(widths: object, said: str) -> None:
+    with pytest.raises(DesignError) as told:
+        read_options(FMSDOB | {"bandwidth_hz": widths})
+    assert str(told.value).startswith(said)
+
+
 @pytest.mark.parametrize(
     "wrong",
     [
         ["--targets-hz", "30000"],
+        ["--targets-hz", "2000", "--bandwidth-hz", "40,50"],
         ["--targets-hz", "2000,x"],
         ["--targets-hz", "2000", "--uncertainty", "2"],
         ["--targets-hz", "2000", "--tones", "2"],

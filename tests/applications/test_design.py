@@ -18,6 +18,7 @@ from stillpath.applications.design.design import design_report
 from stillpath.applications.design.figures import DesignReport
 from stillpath.applications.design.page import render_design, write_design
 from stillpath.applications.design.summary import Summary
+from stillpath.cli.design_tables import print_design
 from stillpath.cli.main import run
 from stillpath.compensation.fbf import LADDER, PreviewFbf
 from stillpath.compensation.shapers import shape, shaper_pulses
@@ -287,7 +288,7 @@ def test_the_same_again_and_through_json(machine: Machine, off: DesignReport) ->
     assert render_design(again) == render_design(off)
 
 
-def test_refusals_are_findings() -> None:
+def test_refusals_are_findings(capsys: pytest.CaptureFixture[str]) -> None:
     lone = load_machine(GOLDEN)
     report = report_of(lone, basis="robust")
     assert report.chosen is None
@@ -296,6 +297,8 @@ def test_refusals_are_findings() -> None:
     assert any("fbf" in reason for reason in report.robustness.missing)
     assert report.metrics.robust == ()
     assert "every design was refused" in render_design(report)
+    print_design(report)
+    assert capsys.readouterr().out.count("refused: fbf off") == 1
     assert report_of(lone, robust="minimax").chosen is not None
 
 

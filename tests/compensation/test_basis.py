@@ -179,7 +179,7 @@ def test_every_input_gets_the_functions() -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda s: dct_basis(M, M + 1), "n = 81 basis functions in a window of 80"),
+        (lambda s: dct_basis(M, M + 1), "n = 81 basis functions of 80 samples: take 1 to 80"),
         (lambda s: bspline_functions(M, 3, 3), "n = 3 B-splines of degree 3: take at least 4"),
         (lambda s: ce_opt_basis(s.gram, 0), "n = 0 "),
         (lambda s: robust_basis(s.gram, s.mean, 70, r=20), "take at most 60"),
