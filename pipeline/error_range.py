@@ -40,9 +40,10 @@ _FRICTION_UNSURE, _WHEELS_UNSURE = 0.35, 1.0
 that far, up to half of it is not found."""
 _FRICTION_UNSEEN_MM_S2 = 1500.0
 """Dry friction over moving mass that tables may hide: .4 N on .25 kg of rails, 1.5 N on a bed."""
-_LAG_UNSURE_S, _LAG_UNKNOWN_S = 1.5e-4, 3e-4
+_LAG_UNSURE_S, _LAG_UNKNOWN_S = 1.5e-4, 4e-4
 """Unknown delay of X against Y: alignment sets both to 0, but viscous guides may delay one; clocks
-of logs tell some of it (`models.identification.clocks`), those of ring tests are not compared."""
+of logs tell some of it (`models.identification.clocks`), those of ring tests are not compared
+(on virtual printers one axis follows up to 0.38 ms later)."""
 
 
 @dataclass(frozen=True, slots=True)
