@@ -153,3 +153,25 @@ def test_friction_that_was_found_too_small_counts_in_a_gentle_print_too(
     true_um = 1e3 * gentle.rms_mm(printed(printer(f_hz, rubs), commands[1]))
     assert low_um < true_um < high_um
     assert true_um > 2.0 * known.high * predicted_um  # as much as plants alone would explain
+
+
+def test_a_ring_test_does_not_tell_which_axis_follows_later() -> None:
+    """One that does by a third of a millisecond prints within the range, not within raw logs'."""
+    f_hz = {"x": 60.0, "y": 45.0}
+    machine, motion = machine_of(f_hz), Motion()
+    command = motion.shaped(machine, f_hz)
+    made = printed(printer(f_hz, 0.0), command)
+    late = np.arange(made.shape[1]) - 0.35e-3 / DT_S
+    made[1] = np.interp(late, np.arange(made.shape[1]), made[1])
+    true_um, most_um = 1e3 * motion.rms_mm(made), {}
+    for kind in ("raw log", "ring test"):
+        about = Provenance(kind=kind, phase="aligned at low frequency")
+        axes = {a: s.model_copy(update={"provenance": about}) for a, s in machine.axes.items()}
+        found = error_ranges(
+            machine.model_copy(update={"axes": axes}),
+            {"shaper": [command]},
+            lambda one: motion.rms_mm(one[0]),
+            DT_S,
+        )["shaper"]
+        most_um[kind] = found.around_um(found.reference_um)[1]
+    assert most_um["raw log"] < true_um < most_um["ring test"]
