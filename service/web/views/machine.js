@@ -5,6 +5,7 @@ import { fill, h } from "../lib/dom.js";
 import { capital, number } from "../lib/format.js";
 import { fileLink } from "../lib/files.js";
 import { problemPanel } from "../lib/problem.js";
+import { rememberMachine } from "../parts/machine-picker.js";
 import { folded } from "../parts/table.js";
 import { filterButton } from "../job/ways.js";
 import { measurementPanel } from "../machine/measurement.js";
@@ -23,7 +24,8 @@ export async function show({ main, signal, setTitle, params: [name] }) {
   const history = h("div");
   fill(main,
     h("p.crumb", null, h("a", { href: "#/machines" }, "Machines"), " / "),
-    h("div.head", null, h("h1", null, machine.title), h("span.badge", { dataset: { state: isOwn ? "own" : "builtin" } }, isOwn ? "Your own" : "Built in")),
+    h("div.head", null, h("h1", null, machine.title), h("span.badge", { dataset: { state: isOwn ? "own" : "builtin" } }, isOwn ? "Your own" : "Built in"),
+      h("a.button.main.end", { href: "#/", onclick: () => rememberMachine(machine.name) }, "New job")),
     h("p.lead", null, h("code", null, machine.name), ` · ${machine.kinematics} · ${machine.firmware.kind}`, machine.source ? ` · ${machine.source}` : ""),
     h("section", null, h("h2", null, "Frequency response"), plots),
     isOwn ? h("section", null, h("h2", null, "Revisions"), history) : null,

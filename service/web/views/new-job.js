@@ -8,10 +8,8 @@ import { fill, h, hide } from "../lib/dom.js";
 import { bytes } from "../lib/format.js";
 import { problemPanel } from "../lib/problem.js";
 import { dropZone } from "../parts/drop-zone.js";
-import { machinePicker } from "../parts/machine-picker.js";
+import { machinePicker, rememberMachine, rememberedMachine } from "../parts/machine-picker.js";
 
-const LAST_MACHINE = "stillpath.machine";
-const FILES = ".gcode,.g,.gco,.nc,.bgcode,.3mf,text/*";
 const MODELS = /\.(stl|obj|step|stp|amf|ply)$/i;
 const METHODS = [
   ["", [["fbf", "Compensate"]]],
@@ -33,7 +31,7 @@ export async function show({ main, signal, setTitle }) {
   const machines = await getJson("/v1/machines", { signal });
   /** @type {File | null} */
   let file = null;
-  let machine = remembered();
+  let machine = rememberedMachine();
   if (!machines.some((/** @type {any} */ m) => m.name === machine && m.problem === null)) machine = null;
 
   const send = h("button.main.large", { type: "submit", disabled: true }, "Compensate");
@@ -59,7 +57,7 @@ export async function show({ main, signal, setTitle }) {
     submit();
   } },
     dropZone({
-      label: "Choose a G-code file, or drop it here", hint: ".gcode, .bgcode or sliced .3mf", accept: FILES,
+      label: "Choose a G-code file, or drop it here", hint: ".gcode, .bgcode or sliced .3mf",
       onChoose: ([chosen]) => {
         file = chosen;
         ready();
@@ -87,7 +85,7 @@ export async function show({ main, signal, setTitle }) {
     if (!file || !machine) return;
     const wrong = complaint(file);
     if (wrong) return fill(status, problemPanel(wrong));
-    remember(machine);
+    rememberMachine(machine);
     const sending = new AbortController();
     signal.addEventListener("abort", () => sending.abort());
     const bar = h("progress", { max: "1", value: "0", "aria-label": "Sent" });
@@ -212,22 +210,4 @@ function select(id, groups) {
 function field(id, label, control, hint) {
   if (hint) control.setAttribute("aria-describedby", `${id}-hint`);
   return h("div.field", null, h("label", { for: id }, label), control, hint ? h("p.hint", { id: `${id}-hint` }, hint) : null);
-}
-
-/** @returns {string | null} */
-function remembered() {
-  try {
-    return localStorage.getItem(LAST_MACHINE);
-  } catch {
-    return null;
-  }
-}
-
-/** @param {string} name */
-function remember(name) {
-  try {
-    localStorage.setItem(LAST_MACHINE, name);
-  } catch {
-    // Storage may be blocked; the machine is then chosen each time.
-  }
 }
