@@ -15,6 +15,7 @@ import pytest
 from stillpath.service import server
 from stillpath.service.server import serve_forever
 from stillpath.service.settings import Settings
+from tests.service.jobs.site import STILLPATH
 from tests.service.test_server import REAL, ROOT
 
 pytestmark = pytest.mark.slow
@@ -58,6 +59,16 @@ def test_a_taken_port_is_named_with_the_remedy(tmp_path: Path):
         port = taken.getsockname()[1]
         with pytest.raises(OSError, match=f"{port}; .*--port"):
             serve_forever(Settings(data_dir=tmp_path), "127.0.0.1", port)
+
+
+def test_a_scheduler_names_a_taken_port_in_one_line():
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        command = [*STILLPATH, "scheduler", "--host", "127.0.0.1", "--port", port]
+        told = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert told.returncode == 1
+    assert f"127.0.0.1:{port} (Address already in use); choose another --port" in told.stderr
+    assert told.stderr.count("\n") == 1
 
 
 @pytest.mark.skipif(os.name != "posix", reason="sends signals")
