@@ -86,6 +86,21 @@ def test_the_address_that_is_named_first_answers(
         socket.create_connection((first.hostname, first.port), timeout=60).close()
 
 
+def test_other_computers_are_given_an_address_without_a_name():
+    with server._listening("0.0.0.0", 0) as listener:
+        port = listener.getsockname()[1]
+        hosts = [urlsplit(address).hostname for address in server._addresses("0.0.0.0", port)]
+        numbers = [host for host in hosts if host and host.replace(".", "").isdecimal()]
+        for host in numbers:
+            socket.create_connection((host, port), timeout=60).close()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))
+        except OSError:
+            pytest.skip("no network")
+    assert len(numbers) == 2
+
+
 def test_a_service_ends_before_its_workers_are_up(tmp_path: Path):
     process = start(tmp_path)
     assert process.stdout is not None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -229,3 +230,41 @@ def test_a_phone_lets_any_file_be_chosen(visitor: Visitor):
         fields = visitor.open(view).locator("input[type=file]")
         fields.first.wait_for(state="attached")
         assert not any(field.get_attribute("accept") for field in fields.all())
+
+
+def test_a_document_is_changed_and_given_back(visitor: Visitor, service: Service, tmp_path: Path):
+    visitor.expected.add(422)
+    put(service, "edited")
+    page = visitor.open("#/machines/edited", viewport={"width": 360, "height": 740})
+    with page.expect_download() as download:
+        page.get_by_role("link", name="Document (JSON)").click()
+    document = json.loads(download.value.path().read_text())
+    form = page.locator("form", has=page.get_by_role("link", name="Document (JSON)"))
+    keep = form.get_by_role("button", name="Keep the document as the next revision")
+
+    def give(name: str, text: str) -> None:
+        (tmp_path / name).write_text(text)
+        form.locator("input[type=file]").set_input_files(tmp_path / name)
+        keep.click()
+
+    give("another.json", json.dumps(document | {"name": "another"}))
+    expect(form.get_by_role("alert")).to_contain_text("make both the same")
+    give("printer.cfg", "[printer]\n")
+    expect(form.get_by_role("alert")).to_contain_text("not JSON")
+    document["travel"]["x"]["min_mm"] = -4.0
+    give("edited.json", json.dumps(document))
+    expect(page.get_by_role("button", name="Approve revision 3")).to_be_visible()
+    assert service.api.get("/v1/machines/edited").json()["travel"]["x"]["min_mm"] == -4.0
+    visitor.shoot(page, "machine-document")
+
+
+def test_a_machine_is_deleted(visitor: Visitor, service: Service):
+    put(service, "unwanted")
+    page = visitor.open("#/machines/unwanted")
+    page.get_by_role("button", name="Delete the machine").click()
+    page.get_by_role("dialog").get_by_role("button", name="Keep it").click()
+    assert service.api.get("/v1/machines/unwanted").status_code == 200
+    page.get_by_role("button", name="Delete the machine").click()
+    page.get_by_role("dialog").get_by_role("button", name="Delete").click()
+    expect(page.get_by_role("heading", name="Machines", exact=True)).to_be_visible()
+    assert service.api.get("/v1/machines/unwanted").status_code == 404
