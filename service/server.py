@@ -111,9 +111,21 @@ def _addresses(host: str, port: int) -> list[str]:
     if host in ("0.0.0.0", "::", ""):
         name = socket.gethostname()
         here = "[::1]" if host == "::" and not _is_dual(host) else "127.0.0.1"
-        return [f"http://{here}:{port}/", f"http://{name}:{port}/ (from other computers)"]
+        others = [name, *_own_address()]
+        return [
+            f"http://{here}:{port}/",
+            *(f"http://{other}:{port}/ (from other computers)" for other in others),
+        ]
     shown = f"[{host}]" if ":" in host else host
     return [f"http://{shown}:{port}/"]
+
+
+def _own_address() -> list[str]:
+    """Return this computer's address in its network, if it has one: phones know no names."""
+    with contextlib.suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.connect(("192.0.2.1", 9))  # sends nothing; an address for documentation (RFC 5737)
+        return [probe.getsockname()[0]]
+    return []
 
 
 @contextlib.contextmanager

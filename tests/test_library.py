@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ from tests.web.served import running
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
+LAYERS = [path.name for path in (ROOT / "src" / "stillpath").iterdir() if path.is_symlink()]
 EXAMPLES = dict(re.findall(r"^## (.+?)\n.*?```python\n(.+?)```", PAGE, re.DOTALL | re.MULTILINE))
 
 
@@ -54,6 +56,33 @@ def test_rooms_are_imported_below_stillpath_only() -> None:
     assert len(files) > 300
     other = re.compile(rf"^\s*(?:from|import) (?:{'|'.join(layers)})\b", re.MULTILINE)
     assert [path for path in files if other.search(path.read_text(encoding="utf-8"))] == []
+
+
+def test_a_checkout_without_links_makes_the_same_wheel(tmp_path: Path) -> None:
+    # Git on Windows and zip files leave short texts in their place.
+    checkout, package = tmp_path / "checkout", tmp_path / "checkout" / "src" / "stillpath"
+    package.mkdir(parents=True)
+    for path in (ROOT / "src" / "stillpath").iterdir():
+        if path.is_symlink():
+            (package / path.name).write_text(f"../../{path.name}")
+        elif path.is_file():
+            shutil.copy(path, package)
+    for name in ("pyproject.toml", "README.md", "LICENSE", "integrations", *LAYERS):
+        (checkout / name).symlink_to(ROOT / name)
+    build = [sys.executable, "-m", "hatchling", "build", "--target", "wheel", "-d", str(tmp_path)]
+    subprocess.run(build, cwd=checkout, check=True, capture_output=True)
+    (wheel,) = tmp_path.glob("*.whl")
+    made = {name for name in zipfile.ZipFile(wheel).namelist() if name.endswith(".py")}
+    package = ROOT / "src" / "stillpath"
+    modules = [*package.glob("*.py"), *(p for k in LAYERS for p in (package / k).rglob("*.py"))]
+    assert made == {p.relative_to(ROOT / "src").as_posix() for p in modules} | {"stillpath_post.py"}
+
+
+def test_python_runs_it_as_a_module() -> None:
+    told = subprocess.run(
+        [sys.executable, "-m", "stillpath", "--version"], capture_output=True, text=True, check=True
+    )
+    assert stillpath.__version__ in told.stdout
 
 
 @pytest.mark.slow

@@ -363,8 +363,8 @@ def _expected(store: MachineStore, name: str, if_match: str | None) -> int:
             raise Problem(
                 428,
                 "Precondition required",
-                f"Machine {name!r} exists already. Take another name; or, to change it, send its "
-                "ETag as If-Match, so that nobody's change is lost.",
+                f"Machine {name!r} exists already. Take another name, or change it on its page "
+                "(over HTTP: with its ETag as If-Match, so that nobody's change is lost).",
             )
         return _check_state(store, name, if_match)
 
@@ -394,8 +394,8 @@ def _built_in(name: str) -> Problem:
     return Problem(
         409,
         "Built-in machine",
-        f"{name!r} is a built-in machine: it has no revisions and cannot be changed. PUT its "
-        "document under another name.",
+        f"{name!r} is a built-in machine: it has no revisions and cannot be changed. Take "
+        "another name for yours.",
     )
 
 

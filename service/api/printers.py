@@ -97,7 +97,7 @@ def _compared(request: Request, name: str, *, accept: bool) -> PrinterCheck:
     printers: Mapping[str, Printer] = state.printers
     printer = printers.get(name)
     if printer is None:
-        known = ", ".join(sorted(printers)) or "none"
+        known = ", ".join(sorted(printers)) or "none; STILLPATH_PRINTERS names their file"
         raise Problem(404, "No such printer", f"No printer is called {name!r:.80}. Known: {known}.")
     if printer.kind != "moonraker":
         raise Problem(

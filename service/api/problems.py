@@ -224,8 +224,8 @@ _EXAMPLES: dict[int, dict[str, Any]] = {
         problem(
             428,
             "Precondition required",
-            "Machine 'mine' exists already. Take another name; or, to change it, send its ETag as "
-            "If-Match, so that nobody's change is lost.",
+            "Machine 'mine' exists already. Take another name, or change it on its page (over "
+            "HTTP: with its ETag as If-Match, so that nobody's change is lost).",
         ),
         problem(429, "Too many requests", "More than 1200 requests in a minute. Wait 1 s."),
         problem(503, "Not ready", not_ready("database")),

@@ -45,7 +45,17 @@ def run_scheduler(host: str, port: int) -> None:
                 sys.stdout.flush()
                 await stopped.wait()
 
-    asyncio.run(main())
+    try:
+        asyncio.run(main())
+    except RuntimeError as error:  # Dask's, around what the system says
+        if not isinstance(cause := error.__cause__, OSError):
+            raise
+        where = f"{host}:{port} ({cause.strerror})"
+        raise OSError(
+            cause.errno,
+            f"the scheduler cannot listen on {where}; choose another --port, or an address of this "
+            "computer as --host",
+        ) from None
 
 
 def run_workers(settings: Settings) -> None:

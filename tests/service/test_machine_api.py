@@ -207,7 +207,7 @@ def test_a_user_s_machine_of_a_name_that_was_built_in_later(
     [revision] = client.get(f"{where}/revisions").json()["revisions"]
     assert revision["approval"]["author"] == "local"
     assert client.get(f"{where}/revisions/1").status_code == 200
-    assert_problem(put(client, make_machine("ender3"), where, **{"If-Match": etag}), 409, "PUT its")
+    assert_problem(put(client, make_machine("ender3"), where, **{"If-Match": etag}), 409, "another")
     assert client.delete(where).status_code == 204
     assert_problem(client.get(f"{where}/revisions"), 409, "built-in")
 

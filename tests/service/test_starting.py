@@ -15,6 +15,7 @@ import pytest
 from stillpath.service import server
 from stillpath.service.server import serve_forever
 from stillpath.service.settings import Settings
+from tests.service.jobs.site import STILLPATH
 from tests.service.test_server import REAL, ROOT
 
 pytestmark = pytest.mark.slow
@@ -60,6 +61,16 @@ def test_a_taken_port_is_named_with_the_remedy(tmp_path: Path):
             serve_forever(Settings(data_dir=tmp_path), "127.0.0.1", port)
 
 
+def test_a_scheduler_names_a_taken_port_in_one_line():
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        command = [*STILLPATH, "scheduler", "--host", "127.0.0.1", "--port", port]
+        told = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert told.returncode == 1
+    assert f"127.0.0.1:{port} (Address already in use); choose another --port" in told.stderr
+    assert told.stderr.count("\n") == 1
+
+
 @pytest.mark.skipif(os.name != "posix", reason="sends signals")
 @pytest.mark.parametrize("dual", [True, False])
 @pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0", "::1", "::"])
@@ -73,6 +84,21 @@ def test_the_address_that_is_named_first_answers(
     with server._listening(host, 0) as listener:
         first = urlsplit(server._addresses(host, listener.getsockname()[1])[0])
         socket.create_connection((first.hostname, first.port), timeout=60).close()
+
+
+def test_other_computers_are_given_an_address_without_a_name():
+    with server._listening("0.0.0.0", 0) as listener:
+        port = listener.getsockname()[1]
+        hosts = [urlsplit(address).hostname for address in server._addresses("0.0.0.0", port)]
+        numbers = [host for host in hosts if host and host.replace(".", "").isdecimal()]
+        for host in numbers:
+            socket.create_connection((host, port), timeout=60).close()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))
+        except OSError:
+            pytest.skip("no network")
+    assert len(numbers) == 2
 
 
 def test_a_service_ends_before_its_workers_are_up(tmp_path: Path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -206,3 +207,85 @@ def test_a_machine_is_made_of_a_config_g(visitor: Visitor, tmp_path: Path):
     page.get_by_role("button", name="Keep the settings as the next revision").click()
     expect(page.get_by_role("button", name="Show differences")).to_be_visible()
     visitor.shoot(page, "machine-of-config-g")
+
+
+def test_a_new_machine_takes_nobody_s_place(visitor: Visitor, service: Service):
+    put(service, "theirs")
+    page = visitor.open("#/machines")
+    for form in (page.locator(f"form:has(#{name})") for name in ("settings-name", "new-name")):
+        field = form.get_by_label("Name of your machine")
+        for name, said in {"theirs": "You have", "ender3": "built in", "theirs2": ""}.items():
+            field.fill(name)
+            assert said in (complaint := field.evaluate("field => field.validationMessage"))
+            assert bool(said) == bool(complaint)
+
+
+def test_what_no_printer_s_settings_are_is_not_read(visitor: Visitor, tmp_path: Path):
+    file = tmp_path / "raw_data_x.csv"
+    file.write_bytes(b"#time,accel_x,accel_y,accel_z\n" + b"0.1,1.0,2.0,3.0\n" * 300_000)
+    page = visitor.open("#/machines")
+    form = page.locator("form:has(#settings-name)")
+    form.locator("input[type=file]").set_input_files(file)
+    expect(form.get_by_role("alert")).to_contain_text("raw_data_x.csv is larger than 4 MB")
+    expect(form.get_by_role("button", name="Make the machine")).to_be_disabled()
+
+
+def test_a_machine_leads_to_a_job_for_it(visitor: Visitor, service: Service):
+    put(service, "zz-last")
+    page = visitor.open("#/machines/zz-last")
+    page.get_by_role("main").get_by_role("link", name="New job").click()
+    expect(page.get_by_role("combobox", name="Machine")).to_have_value("My printer")
+    expect(page.locator("#machine-hint")).to_contain_text("zz-last")
+    # One's own come first, however many are built in.
+    page.get_by_role("combobox", name="Machine").fill("")
+    page.get_by_role("combobox", name="Machine").press("ArrowDown")
+    origins = page.get_by_role("option").all_inner_texts()
+    assert [text.endswith("own") for text in origins] == sorted(
+        (text.endswith("own") for text in origins), reverse=True
+    )
+
+
+def test_a_phone_lets_any_file_be_chosen(visitor: Visitor):
+    """Phones know no type for .gcode and .cfg: where types are asked for, those are greyed out."""
+    for view in ("#/", "#/machines", "#/machines/ender3"):
+        fields = visitor.open(view).locator("input[type=file]")
+        fields.first.wait_for(state="attached")
+        assert not any(field.get_attribute("accept") for field in fields.all())
+
+
+def test_a_document_is_changed_and_given_back(visitor: Visitor, service: Service, tmp_path: Path):
+    visitor.expected.add(422)
+    put(service, "edited")
+    page = visitor.open("#/machines/edited", viewport={"width": 360, "height": 740})
+    with page.expect_download() as download:
+        page.get_by_role("link", name="Document (JSON)").click()
+    document = json.loads(download.value.path().read_text())
+    form = page.locator("form", has=page.get_by_role("link", name="Document (JSON)"))
+    keep = form.get_by_role("button", name="Keep the document as the next revision")
+
+    def give(name: str, text: str) -> None:
+        (tmp_path / name).write_text(text)
+        form.locator("input[type=file]").set_input_files(tmp_path / name)
+        keep.click()
+
+    give("another.json", json.dumps(document | {"name": "another"}))
+    expect(form.get_by_role("alert")).to_contain_text("make both the same")
+    give("printer.cfg", "[printer]\n")
+    expect(form.get_by_role("alert")).to_contain_text("not JSON")
+    document["travel"]["x"]["min_mm"] = -4.0
+    give("edited.json", json.dumps(document))
+    expect(page.get_by_role("button", name="Approve revision 3")).to_be_visible()
+    assert service.api.get("/v1/machines/edited").json()["travel"]["x"]["min_mm"] == -4.0
+    visitor.shoot(page, "machine-document")
+
+
+def test_a_machine_is_deleted(visitor: Visitor, service: Service):
+    put(service, "unwanted")
+    page = visitor.open("#/machines/unwanted")
+    page.get_by_role("button", name="Delete the machine").click()
+    page.get_by_role("dialog").get_by_role("button", name="Keep it").click()
+    assert service.api.get("/v1/machines/unwanted").status_code == 200
+    page.get_by_role("button", name="Delete the machine").click()
+    page.get_by_role("dialog").get_by_role("button", name="Delete").click()
+    expect(page.get_by_role("heading", name="Machines", exact=True)).to_be_visible()
+    assert service.api.get("/v1/machines/unwanted").status_code == 404

@@ -12,6 +12,7 @@ from playwright.sync_api import Browser, Page, Route, expect
 
 from stillpath.service.api.schemas import JobView
 from stillpath.service.compiling import STAGE
+from tests.service.deliveries.listeners import octoprint, until, uploads
 from tests.web.served import GEAR, PART, Service, running
 from tests.web.visitor import Visitor
 
@@ -633,3 +634,39 @@ def test_a_job_says_how_it_is_with_it(visitor: Visitor, job: dict[str, Any], sai
     panel = page.get_by_role("region", name="Progress")
     expect(panel).to_contain_text(said)
     expect(panel).to_contain_text(running["stage"].capitalize())
+
+
+def test_a_result_is_sent_to_a_printer(visitor: Visitor, tmp_path: Path):
+    file = tmp_path / "wheel.gcode"
+    file.write_bytes(PART.partition(b";LAYER:2\n")[0])
+    with octoprint(key="k") as host:
+        listed = tmp_path / "printers.toml"
+        listed.write_text(
+            f'[printer.left]\nkind = "octoprint"\nurl = "{host.url}/octo"\nmachine = "ender3"\n'
+            f'api_key = "k"\n[printer.right]\nkind = "octoprint"\nurl = "{host.url}/octo"\n'
+            'machine = "voron-v0"\nstart = true\n'
+        )
+        with running(tmp_path / "farm", STILLPATH_PRINTERS=str(listed)) as farm:
+            page = visitor.open(at=farm.url, viewport={"width": 360, "height": 740})
+            goal = page.get_by_label("When it is done")
+            expect(goal).to_be_hidden()
+            choose_machine(page, "annex-k3")
+            expect(goal).to_be_hidden()
+            choose_machine(page, "voron-v0")
+            expect(goal.get_by_role("option")).to_have_text(
+                [re.compile("waits"), "Send it to right", "Send it to right, and print it"]
+            )
+            goal.select_option("Send it to right")
+            choose_machine(page, "ender3")
+            expect(goal.get_by_role("option")).to_have_text(
+                [re.compile("waits"), "Send it to left"]
+            )
+            goal.select_option("Send it to left")
+            page.locator("input[type=file]").set_input_files(file)
+            visitor.shoot(page, "new-job-printer")
+            page.get_by_role("button", name="Compensate").click()
+            expect(page.get_by_text("the printer left")).to_be_visible()
+            until(lambda: uploads(host), 240.0)
+            page.close()  # else it would miss the service
+        (sent,) = uploads(host)
+        assert b"wheel.stillpath.gcode" in sent.body

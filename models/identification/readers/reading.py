@@ -48,6 +48,8 @@ _STATED_NAME = re.compile(
     rf"(?<![a-z0-9])(?:axis[ =_-]?({_DIRECTION}|[xyz])|([xyz])[ _-]?axis)(?![a-z0-9])"
 )
 # belt_<date>_A.csv and belts_<date>_A.csv of Shake&Tune 1 to 4, and its shaketune-belt_A.csv.
+_SECTION = re.compile(rb"(?m)^\[(?:printer|mcu|extruder|stepper_\w+|include [^\]\n]+)\]")
+"""What Klipper's configuration consists of."""
 _BELT_NAME = re.compile(r"(?:^|[_-])belts?_(?:\w+_)?([ab])(?=[_.]|$)")
 # With the number of a repeat: of qidi-x-max-y1.csv, x alone would count.
 _ANY_NAME = re.compile(rf"(?:^|[_-])({_DIRECTION}|[xyz])\d?(?=[_.-]|$)")
@@ -121,6 +123,12 @@ def _from_content(
 ) -> tuple[Measurement, ...]:
     if is_shaketune(content):
         return read_shaketune(content, name, axis, settings)
+    if _SECTION.search(content, 0, _HEAD_BYTES):
+        raise ModelError(
+            f"{name}: a printer.cfg says limits and travel, and holds no measurement: make a "
+            "machine of it (machines from-config, or Machines on the page), and identify that from "
+            "the files of Klipper's TEST_RESONANCES"
+        )
     is_json = content.lstrip(b"\xef\xbb\xbf \t\r\n")[:1] in (b"{", b"[")
     if (is_json or is_matlab(content)) and len(content) > _LARGEST_MODEL_BYTES:
         raise ModelError(

@@ -6,7 +6,7 @@ import { fill, h } from "../lib/dom.js";
 import { counted } from "../lib/format.js";
 import { problemPanel } from "../lib/problem.js";
 import { dropZone } from "../parts/drop-zone.js";
-import { NAME } from "./name.js";
+import { nameField } from "./name.js";
 import { fitPlots } from "./plots.js";
 
 const TEST = [
@@ -28,7 +28,7 @@ export function measurementPanel({ machines, base, own = false, signal }) {
   let files = [];
   const result = h("div", { "aria-live": "polite" });
   const look = h("button.main", { type: "submit", disabled: true }, "Look at the fit");
-  const name = h("input", { type: "text", id: "new-name", required: !own, ...NAME, autocomplete: "off", spellcheck: "false", "aria-describedby": "new-name-hint" });
+  const name = nameField("new-name", machines);
   const start = h("select", { id: "base", required: true }, h("option", { value: "" }, "Choose the most similar"), machines.filter((m) => m.problem === null).map((m) => h("option", { value: m.name, selected: m.name === base }, m.title)));
   const author = h("input", { type: "text", id: "measured-by", maxlength: "100", autocomplete: "name" });
   const test = testOptions();
@@ -36,14 +36,14 @@ export function measurementPanel({ machines, base, own = false, signal }) {
     event.preventDefault();
     send(chosen(), true);
   } },
-    dropZone({ label: "Choose measurements, or drop them here", hint: "Klipper's raw_data_*.csv or resonances_*.csv, Shake&Tune's .stdata, a ring test with its logs, frequency responses, recordings; several at once", accept: ".csv,.txt,.json,.mat,.stdata,.gcode,.gz,.zst,text/*", multiple: true,
+    dropZone({ label: "Choose measurements, or drop them here", hint: "Klipper's raw_data_*.csv or resonances_*.csv, Shake&Tune's .stdata, a ring test with its logs, frequency responses, recordings; several at once", multiple: true,
       onChoose: (chosen) => {
         files = chosen;
         look.disabled = false;
         fill(result);
       } }),
     h("div.fields", null,
-      own ? null : h("div.field", null, h("label", { for: "new-name" }, "Name of your machine"), name, h("p.hint", { id: "new-name-hint" }, "Small letters, digits, - and _.")),
+      own ? null : name.field,
       own || base !== null ? null : h("div.field", null, h("label", { for: "base" }, "Travel and limits from"), start),
       h("div.field", null, h("label", { for: "measured-by" }, "Your name"), author)),
     test.element,
@@ -51,7 +51,7 @@ export function measurementPanel({ machines, base, own = false, signal }) {
 
   /** What is asked for now; the fit that is looked at is kept as it was asked for. */
   function chosen() {
-    const target = own ? /** @type {string} */ (base) : name.value;
+    const target = own ? /** @type {string} */ (base) : name.input.value;
     return { target, files: [...files], options: { base: own ? "" : base ?? start.value, ...test.read() } };
   }
 

@@ -5,10 +5,12 @@ import { announce } from "../lib/announce.js";
 import { fill, h, hide } from "../lib/dom.js";
 import { problemPanel } from "../lib/problem.js";
 import { dropZone } from "../parts/drop-zone.js";
-import { NAME } from "./name.js";
+import { nameField } from "./name.js";
 
 const ENDS = "\\s*(-?[0-9.]+\\s*:\\s*)?[0-9.]+\\s*";
 const TRAVEL = `${ENDS}[xX]${ENDS}[xX]${ENDS}`;
+/** As `service/api/machine_settings.py` has it. */
+const LARGEST_BYTES = 4e6;
 const M503 = /^.*\bM(92|201|203|204|205)\s+[A-Z]/m;
 const CONFIG_G = /^[ \t]*(M98[ \t]*P|M563\b|M566\b|M584\b|M669\b)/im;
 
@@ -16,16 +18,16 @@ const CONFIG_G = /^[ \t]*(M98[ \t]*P|M563\b|M566\b|M584\b|M669\b)/im;
 export const SETTINGS = { klipper: "printer.cfg", reprapfirmware: "config.g", marlin: "Marlin's answer to M503" };
 
 /**
- * @param {{machine: {name: string, revision: string} | null, firmware?: string, signal: AbortSignal}} about
- *   `machine`: the one that gets the values, with its firmware, or null for a new one.
+ * @param {{machine: {name: string, revision: string} | null, machines?: any[], firmware?: string, signal: AbortSignal}} about
+ *   `machine`: the one that gets the values, with its firmware, or null for one that is new among `machines`.
  * @returns {HTMLElement}
  */
-export function settingsPanel({ machine, firmware = "", signal }) {
+export function settingsPanel({ machine, machines = [], firmware = "", signal }) {
   let text = "";
   let file = "";
   const status = h("div", { "aria-live": "polite" });
   const keep = h("button.main", { type: "submit", disabled: true }, machine ? "Keep the settings as the next revision" : "Make the machine");
-  const name = h("input", { type: "text", id: "settings-name", required: true, ...NAME, autocomplete: "off", spellcheck: "false", "aria-describedby": "settings-name-hint" });
+  const name = nameField("settings-name", machines);
   const travel = h("input", { type: "text", id: "travel", pattern: TRAVEL, placeholder: "235x235x250", "aria-describedby": "travel-hint" });
   const kinematics = h("select", { id: "kinematics" }, [["cartesian", "Cartesian"], ["corexy", "CoreXY"]].map(([value, words]) => h("option", { value }, words)));
   const [fx, fy] = ["x", "y"].map((axis) => h("input", { type: "number", id: `f${axis}`, min: "1", max: "500", step: "any", placeholder: "as the file says" }));
@@ -39,11 +41,11 @@ export function settingsPanel({ machine, firmware = "", signal }) {
     send();
   } },
     dropZone(machine
-      ? { label: `Choose ${SETTINGS[firmware]}, or drop it here`, hint: "What it does not say stays as it is, and so does what was measured", accept: ".cfg,.g,.txt,.log,.gcode,text/*", onChoose }
-      : { label: "Choose printer.cfg, config.g or Marlin's answer to M503, or drop it here", hint: "Klipper: printer.cfg. RepRapFirmware: config.g of the folder sys. Marlin: send M503 from a host, and save all of the answer as a text file", accept: ".cfg,.g,.txt,.log,text/*", onChoose }),
+      ? { label: `Choose ${SETTINGS[firmware]}, or drop it here`, hint: "What it does not say stays as it is, and so does what was measured", onChoose }
+      : { label: "Choose printer.cfg, config.g or Marlin's answer to M503, or drop it here", hint: "Klipper: printer.cfg. RepRapFirmware: config.g of the folder sys. Marlin: send M503 from a host, and save all of the answer as a text file", onChoose }),
     machine ? null : [
       h("div.fields", null,
-        field("settings-name", "Name of your machine", name, "Small letters, digits, - and _."),
+        name.field,
         field("fx", "Resonance of X, Hz", fx, "If you know it. A measurement replaces it."),
         field("fy", "Resonance of Y, Hz", fy)),
       marlin],
@@ -51,6 +53,11 @@ export function settingsPanel({ machine, firmware = "", signal }) {
 
   /** @param {File[]} files */
   async function onChoose([chosen]) {
+    keep.disabled = true;
+    if (chosen.size > LARGEST_BYTES) {
+      fill(status, problemPanel({ title: "Not a printer's settings", detail: `${chosen.name} is larger than 4 MB, which no printer's settings are. Choose another file; for measurements there is another field on this page.` }));
+      return;
+    }
     text = await chosen.text();
     file = chosen.name;
     hide(marlin, CONFIG_G.test(text) || !M503.test(text));
@@ -60,7 +67,7 @@ export function settingsPanel({ machine, firmware = "", signal }) {
   }
 
   async function send() {
-    const target = machine ? machine.name : name.value;
+    const target = machine ? machine.name : name.input.value;
     keep.disabled = true;
     try {
       const query = machine || marlin.hidden

@@ -4,13 +4,14 @@ import { fill, h, uniqueId } from "../lib/dom.js";
 import { bytes } from "../lib/format.js";
 
 /**
- * @param {{label: string, hint: string, accept?: string, multiple?: boolean,
+ * @param {{label: string, hint: string, multiple?: boolean,
  *   onChoose: (files: File[]) => void}} options
  * @returns {HTMLElement}
  */
-export function dropZone({ label, hint, accept, multiple = false, onChoose }) {
+export function dropZone({ label, hint, multiple = false, onChoose }) {
   const id = uniqueId("file");
-  const input = h("input", { type: "file", id, accept, multiple, "aria-describedby": `${id}-hint` });
+  // No `accept`: phones know no type for .gcode or .cfg, and would let nobody choose such a file.
+  const input = h("input", { type: "file", id, multiple, "aria-describedby": `${id}-hint` });
   const name = h("strong", null, label);
   const more = h("small", { id: `${id}-hint` }, hint);
   const zone = h("label.drop", { for: id }, input,

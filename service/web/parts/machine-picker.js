@@ -4,6 +4,8 @@ import { announce } from "../lib/announce.js";
 import { fill, h } from "../lib/dom.js";
 import { counted } from "../lib/format.js";
 
+const LAST_MACHINE = "stillpath.machine";
+
 /**
  * @typedef {{name: string, title: string, origin: string, kinematics: string,
  *   problem: string | null}} Machine
@@ -16,7 +18,8 @@ import { counted } from "../lib/format.js";
  * @returns {HTMLElement}
  */
 export function machinePicker(machines, chosen, onChoose) {
-  const usable = machines.filter((m) => m.problem === null);
+  const isOwn = (/** @type {Machine} */ m) => m.origin === "own";
+  const usable = machines.filter((m) => m.problem === null).sort((a, b) => Number(isOwn(b)) - Number(isOwn(a)));
   const list = h("ul.options", {
     role: "listbox", id: "machine-options", "aria-label": "Machines", hidden: true,
     // The field keeps the focus. Not `onpointerdown`: a finger may mean to scroll.
@@ -110,4 +113,22 @@ export function machinePicker(machines, chosen, onChoose) {
   input.value = current?.title ?? "";
   tell();
   return h("div.picker", null, h("label", { for: "machine" }, "Machine"), input, list, hint);
+}
+
+/** @returns {string | null} The machine that this browser named last. */
+export function rememberedMachine() {
+  try {
+    return localStorage.getItem(LAST_MACHINE);
+  } catch {
+    return null;
+  }
+}
+
+/** @param {string} name */
+export function rememberMachine(name) {
+  try {
+    localStorage.setItem(LAST_MACHINE, name);
+  } catch {
+    // Storage may be blocked; the machine is then chosen each time.
+  }
 }

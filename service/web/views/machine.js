@@ -3,10 +3,11 @@
 import { getJson, isAbort } from "../lib/api.js";
 import { fill, h } from "../lib/dom.js";
 import { capital, number } from "../lib/format.js";
-import { fileLink } from "../lib/files.js";
 import { problemPanel } from "../lib/problem.js";
+import { rememberMachine } from "../parts/machine-picker.js";
 import { folded } from "../parts/table.js";
 import { filterButton } from "../job/ways.js";
+import { documentPanel } from "../machine/document.js";
 import { measurementPanel } from "../machine/measurement.js";
 import { identifiedPlots, responsePlots } from "../machine/plots.js";
 import { revisionPanel } from "../machine/revisions.js";
@@ -23,7 +24,8 @@ export async function show({ main, signal, setTitle, params: [name] }) {
   const history = h("div");
   fill(main,
     h("p.crumb", null, h("a", { href: "#/machines" }, "Machines"), " / "),
-    h("div.head", null, h("h1", null, machine.title), h("span.badge", { dataset: { state: isOwn ? "own" : "builtin" } }, isOwn ? "Your own" : "Built in")),
+    h("div.head", null, h("h1", null, machine.title), h("span.badge", { dataset: { state: isOwn ? "own" : "builtin" } }, isOwn ? "Your own" : "Built in"),
+      h("a.button.main.end", { href: "#/", onclick: () => rememberMachine(machine.name) }, "New job")),
     h("p.lead", null, h("code", null, machine.name), ` · ${machine.kinematics} · ${machine.firmware.kind}`, machine.source ? ` · ${machine.source}` : ""),
     h("section", null, h("h2", null, "Frequency response"), plots),
     isOwn ? h("section", null, h("h2", null, "Revisions"), history) : null,
@@ -33,9 +35,8 @@ export async function show({ main, signal, setTitle, params: [name] }) {
     h("section", null, h("h2", null, "Live printing"), summary.live_refusal
       ? h("p", null, `It cannot print live: ${summary.live_refusal}.`)
       : [h("p", null, "The extra inside Klipper compensates with this filter while the printer prints files as sliced."), filterButton(machine.name)]),
-    h("section", null, folded("Travel and limits", () => facts(machine)),
-      h("div.actions", null,
-        fileLink({ text: "Document (JSON)", href: where, name: `${machine.name}.json` }))));
+    h("section", null, isOwn ? h("h2", null, "Document") : null, folded("Travel and limits", () => facts(machine)),
+      documentPanel({ where, name: machine.name, revision: isOwn ? summary.revision ?? null : null, signal })));
 
   const draw = async (/** @type {HTMLElement} */ area, /** @type {() => Promise<Node | Node[]>} */ make) => {
     try {

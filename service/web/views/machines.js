@@ -26,7 +26,7 @@ export async function show({ main, signal, setTitle }) {
     list,
     h("section", null, h("h2", null, "Make your own from the printer's settings"),
       h("p.hint", null, "Limits and travel come from the firmware. How the frame rings is measured afterwards, on the machine's page."),
-      settingsPanel({ machine: null, signal })),
+      settingsPanel({ machine: null, machines, signal })),
     h("section", null, h("h2", null, "Or from measurements, with another machine's limits"),
       measurementPanel({ machines, base: null, signal })));
 }

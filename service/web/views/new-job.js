@@ -8,10 +8,8 @@ import { fill, h, hide } from "../lib/dom.js";
 import { bytes } from "../lib/format.js";
 import { problemPanel } from "../lib/problem.js";
 import { dropZone } from "../parts/drop-zone.js";
-import { machinePicker } from "../parts/machine-picker.js";
+import { machinePicker, rememberMachine, rememberedMachine } from "../parts/machine-picker.js";
 
-const LAST_MACHINE = "stillpath.machine";
-const FILES = ".gcode,.g,.gco,.nc,.bgcode,.3mf,text/*";
 const MODELS = /\.(stl|obj|step|stp|amf|ply)$/i;
 const METHODS = [
   ["", [["fbf", "Compensate"]]],
@@ -30,10 +28,10 @@ export async function show({ main, signal, setTitle }) {
   ];
   // As narrow as it will be with the form, so that nothing jumps when that comes.
   fill(main, h("div.narrow", null, heading));
-  const machines = await getJson("/v1/machines", { signal });
+  const [machines, printers] = await Promise.all([getJson("/v1/machines", { signal }), getJson("/v1/printers", { signal })]);
   /** @type {File | null} */
   let file = null;
-  let machine = remembered();
+  let machine = rememberedMachine();
   if (!machines.some((/** @type {any} */ m) => m.name === machine && m.problem === null)) machine = null;
 
   const send = h("button.main.large", { type: "submit", disabled: true }, "Compensate");
@@ -51,6 +49,7 @@ export async function show({ main, signal, setTitle }) {
   const method = select("method", METHODS);
   const tolerance = h("input", { type: "number", id: "tolerance", name: "tolerance_um", min: "0.5", max: "50", step: "0.5", value: "2", required: true });
   const options = moreOptions();
+  const goal = destination(printers);
   const written = [field("method", "Method", method),
     field("tolerance", "Tolerance, µm", tolerance, "How far the written path may be from the computed one.")];
   method.addEventListener("change", () => ready());
@@ -59,7 +58,7 @@ export async function show({ main, signal, setTitle }) {
     submit();
   } },
     dropZone({
-      label: "Choose a G-code file, or drop it here", hint: ".gcode, .bgcode or sliced .3mf", accept: FILES,
+      label: "Choose a G-code file, or drop it here", hint: ".gcode, .bgcode or sliced .3mf",
       onChoose: ([chosen]) => {
         file = chosen;
         ready();
@@ -68,14 +67,16 @@ export async function show({ main, signal, setTitle }) {
     }),
     h("div.fields", null, machinePicker(machines, machine, (name) => {
       machine = name;
+      goal.showFor(machine);
       ready();
-    })),
+    }), goal.element),
     way.element,
     h("div.fields.main-fields", null, written),
     options.element,
     h("div.actions", null, send),
     status);
   fill(main, h("div.narrow", null, heading, form));
+  goal.showFor(machine);
   ready();
 
   /** @returns {string} Whether the report compares both ways: where both write or keep the motion. */
@@ -87,7 +88,7 @@ export async function show({ main, signal, setTitle }) {
     if (!file || !machine) return;
     const wrong = complaint(file);
     if (wrong) return fill(status, problemPanel(wrong));
-    remember(machine);
+    rememberMachine(machine);
     const sending = new AbortController();
     signal.addEventListener("abort", () => sending.abort());
     const bar = h("progress", { max: "1", value: "0", "aria-label": "Sent" });
@@ -101,8 +102,8 @@ export async function show({ main, signal, setTitle }) {
     fill(status, h("div.sending", { "aria-live": "off" }, bar, h("div.row", null, text,
       h("button", { type: "button", onclick: () => sending.abort() }, "Cancel"))));
     try {
-      const query = way.isLive() ? { machine, method: "live", name, ...options.readFile() }
-        : { machine, method: method.value, tolerance_um: tolerance.value, name, ...options.read(), compare_live: compares() };
+      const query = way.isLive() ? { machine, method: "live", name, ...options.readFile(), ...goal.read() }
+        : { machine, method: method.value, tolerance_um: tolerance.value, name, ...options.read(), ...goal.read(), compare_live: compares() };
       const job = await upload("/v1/jobs", query, file, (share) => {
         bar.value = share;
         isWhole = share === 1;
@@ -171,6 +172,25 @@ function moreOptions() {
   return { element, read, readFile, showFor };
 }
 
+/** Where the result goes: to a printer of the chosen machine, if the service has one. @param {any[]} printers */
+function destination(printers) {
+  const choice = h("select", { id: "printer" });
+  const element = field("printer", "When it is done", choice);
+  const offer = (/** @type {string} */ printer, /** @type {string} */ print, /** @type {string} */ words) => h("option", { value: JSON.stringify({ printer, print }) }, words);
+  /** @type {string | null | undefined} */
+  let shown;
+  const showFor = (/** @type {string | null} */ machine) => {
+    // Leaving the field of the machine names it anew: what was chosen stays.
+    if (machine === shown) return;
+    shown = machine;
+    const fitting = printers.filter((p) => p.machine === machine);
+    fill(choice, offer("", "", "It waits here to be downloaded"), ...fitting.map((p) => [
+      offer(p.name, "", `Send it to ${p.name}`), p.start ? offer(p.name, "true", `Send it to ${p.name}, and print it`) : null]).flat());
+    hide(element, fitting.length === 0);
+  };
+  return { element, showFor, read: () => JSON.parse(choice.value) };
+}
+
 /**
  * The choice between a written file and live printing.
  *
@@ -212,22 +232,4 @@ function select(id, groups) {
 function field(id, label, control, hint) {
   if (hint) control.setAttribute("aria-describedby", `${id}-hint`);
   return h("div.field", null, h("label", { for: id }, label), control, hint ? h("p.hint", { id: `${id}-hint` }, hint) : null);
-}
-
-/** @returns {string | null} */
-function remembered() {
-  try {
-    return localStorage.getItem(LAST_MACHINE);
-  } catch {
-    return null;
-  }
-}
-
-/** @param {string} name */
-function remember(name) {
-  try {
-    localStorage.setItem(LAST_MACHINE, name);
-  } catch {
-    // Storage may be blocked; the machine is then chosen each time.
-  }
 }

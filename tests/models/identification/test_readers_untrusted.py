@@ -139,6 +139,9 @@ def test_files_that_are_not_read(tmp_path: Path) -> None:
         read_content(b"time, x, y, z\n0.0, 0.1, 0.0, 1.0\n0.1, 0.1, 0.0, 1.0\n", "AXIS_X_1.csv")
     with pytest.raises(ModelError, match=r"looked for .*The first line is 'hello there'"):
         read_content(b"hello there\n1,2\n", "a.csv")
+    for start in (b"", b"# My printer\n\n[mcu]\nserial: /dev/null\n"):
+        with pytest.raises(ModelError, match=r"printer\.cfg: .*holds no measurement"):
+            read_content(start + b"[printer]\nkinematics: corexy\n", "printer.cfg")
     with pytest.raises(ModelError, match="say what repeats"):
         read_content(b"# homed\ntime_s,position_mm,measured_mm\n0,1,1\n.1,2,2\n", "pass.csv")
     with pytest.raises(ModelError, match="0 frequencies, at least 8"):
