@@ -58,10 +58,16 @@ _SIGMAS = 2.0
 _LEAST_GAIN = 2.0
 """Factor by which compensation must lower the vibration."""
 _MOST_MISSES = 0.35
+_HELD = 0.5
+"""Ringing over the least that is predicted, of an axis whose guides stop it."""
 _NEAR, _SURE = 0.01, 3.0
 """A mode counts as moved if beyond both this share and this many standard deviations."""
 _MOST_APART_S = 5e-4
 """Largest difference of the delays of X and Y: at 100 mm/s it distorts corners by 50 um."""
+_OTHERWISE = (
+    "where they are, the sensor felt another braking than the plants': guides rub, or something is "
+    "loose. See to it that the axis moves freely, and measure the machine again"
+)
 _ANEW = "measure the machine again (`stillpath identify`) and write a new ring test"
 _PHASE = (
     "The mode that rings most is where the plants have it, so its phase, its damping or other "
@@ -240,10 +246,12 @@ class _Axis:
             return reason
         seen = [sum(s.compensated is half for s in log.seen) for half in (False, True)]
         if min(seen) < _FEWEST_STOPS or len(log.seen) < _SEEN_SHARE * log.within:
+            whole = log.within == sum(stop.axis == self._axis for stop in self._motion.stops)
+            why = _OTHERWISE if whole else "log the whole file"
             return (
                 f"{name} shows {seen[0]} stops as planned and {seen[1]} compensated of {axis}, of "
                 f"{log.within} in its time ({_FEWEST_STOPS} of each are needed, and "
-                f"{100 * _SEEN_SHARE:.0f} % of all): log the whole file"
+                f"{100 * _SEEN_SHARE:.0f} % of all): {why}"
             )
         if len(floor(log, self._motion, self._band).way) == 0:
             return f"{name} begins after the rest before {axis}: its noise is not known"
@@ -301,10 +309,11 @@ class _Axis:
                 f"{said}: the stops that should be compensated are not, so that no plant of the "
                 "set predicts half of that as planned; write a new ring test"
             )
+        held = _held_text(planned)
         if off.rms < _ABOVE_FLOOR * noise_um:
             return "says nothing", (
                 f"{said}: the noise of the log is {rounded_um(noise_um)} µm, too much for this "
-                "ringing; take a better sensor, or fix it better"
+                f"ringing{f'. {held}' if held else '; take a better sensor, or fix it better'}"
             )
         least, most = on.reaches(-_SIGMAS), on.reaches(_SIGMAS)
         moved = self._moved()
@@ -318,7 +327,7 @@ class _Axis:
         elif missed > _MOST_MISSES:
             why = f"but {100 * missed:.0f} % of the motion is not what any plant of the set does"
         if why:
-            return "not confirmed", f"{said}: {why}. {moved or _PHASE} To do: {_ANEW}."
+            return "not confirmed", f"{said}: {why}. {moved or held or _PHASE} To do: {_ANEW}."
         if most > off.rms / _LEAST_GAIN:
             return "says nothing", (
                 f"{said}: repeated stops differ too much to tell whether compensation halves it; "
@@ -365,6 +374,18 @@ class _Axis:
                 **more,
             }
         )
+
+
+def _held_text(planned: Half) -> str:
+    """Return a text on friction if stops as planned ring far less than all plants would."""
+    low, high = planned.predicted_um
+    if planned.measured_um >= _HELD * low:
+        return ""
+    return (
+        f"As planned it rings far less than the predicted {rounded_um(low)} to {rounded_um(high)} "
+        "µm: guides that rub hold what is so small. See to it that the axis moves freely; raw data "
+        "(OUTPUT=raw_data) show how much they rub, tables do not."
+    )
 
 
 def _delays_compared(axes: list[AxisRing]) -> list[AxisRing]:

@@ -135,12 +135,13 @@ def timed(
         return dict(found)
     begins_s = float(np.mean(intervals_s)) * math.sqrt(sum(1 / len(k) for k in known.values()) / 12)
     sd_s = math.hypot(begins_s, *(logs[0].unsure_s for logs in known.values()))
-    expected_s, unsure_s = _expected(apart_s, sd_s)
-    later_s = abs(expected_s)
-    if not _LEAST_APART_S <= later_s <= _MOST_APART_S:
-        return dict(found)
     later: Axis = "y" if apart_s > 0.0 else "x"
     other = "X" if later == "y" else "Y"
+    expected_s, unsure_s = _expected(abs(apart_s), sd_s)
+    # No axis moves before its command: if the other seems to, this one is not late by that.
+    later_s = min(expected_s, float(np.nanmedian(y_s if later == "y" else x_s)))
+    if not _LEAST_APART_S <= later_s <= _MOST_APART_S:
+        return dict(found)
     if not _plants_agree(known[later], x_s if later == "y" else y_s):
         return dict(found)
     one = found[later]

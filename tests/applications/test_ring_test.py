@@ -195,6 +195,24 @@ def test_a_machine_like_its_plants_is_confirmed(told: RingReport, log: Path) -> 
         assert found.tested_on == TODAY
 
 
+@pytest.mark.parametrize("friction_n", [1.0, 2.5])
+def test_guides_that_rub_are_named(
+    friction_n: float, ring: Path, machine: Machine, tmp_path: Path
+) -> None:
+    """They stop what rings by micrometres: neither noise nor a wrong phase, nor half a log."""
+    true = {axis: replace(chain, friction_n=friction_n) for axis, chain in TRUE.items()}
+    content = recorded(ring, machine, true).raw_data()
+    report = said_of(tmp_path / "a.csv", ring, machine, content)
+    assert "confirmed" not in verdicts(report)
+    for axis in report.axes:
+        assert "See to it that the axis moves freely" in axis.text or "It rings at" in axis.text
+        assert "OUTPUT=raw_data) hold the phase" not in axis.text
+        assert "log the whole file" not in axis.text
+        assert axis.as_planned is None or (
+            axis.as_planned.measured_um < 0.2 * axis.as_planned.predicted_um[0]
+        )
+
+
 def test_friction_that_is_known_counts_in_what_is_predicted(
     machine: Machine, told: RingReport, cache: Path, tmp_path: Path
 ) -> None:

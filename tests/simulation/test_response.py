@@ -66,6 +66,27 @@ def test_modal_form_of_the_library(name: str) -> None:
         )
 
 
+@pytest.mark.parametrize("near", [0.0, 1e-11, 1.552e-13, 1e-9, 1e-6])
+def test_poles_that_are_nearly_one(near: float) -> None:
+    """A fit of raw logs ended like this, and predicted 20 um of error that were none."""
+    spec = PairsSpec(
+        poles=(
+            PolePair(f_hz=57.093315747143414, zeta=0.08732785203799766),
+            PolePair(f_hz=202.24484304374235, zeta=0.8489525974929566),
+            PolePair(f_hz=211.59999999541353, zeta=1.0 - near),
+        ),
+        zeros=(
+            ZeroPair(f_hz=109.77317576821473, zeta=1.0904922787744404),
+            ZeroPair(f_hz=140.27144134544702, zeta=0.39303199716021553),
+        ),
+        real_zero_tau_s=-0.0007266633611885042,
+    )
+    u = np.minimum(0.1 * np.arange(2000), 100.0)
+    for dt_s in (1e-4, 2.5e-4, 1e-3):
+        plant = discretise(spec, dt_s)
+        np.testing.assert_allclose(response([plant], u[None])[0], answer(plant, u), atol=2e-6)
+
+
 def test_long_rest_decays_to_the_command_exactly() -> None:
     plant = discretise(PAIRS, 1e-3)
     u = np.concatenate([np.zeros(10), np.full(60_000, 7.25)])

@@ -117,6 +117,9 @@ ON_TIME = in_bands(0.3, 0.3, 0.3, 0.3)
         # Less than the clocks tell, and more than guides do.
         ([ON_TIME], [in_bands(0.32, 0.33, 0.34, 0.33)], {}),
         ([ON_TIME], [in_bands(2.5, 2.5, 2.5, 2.5)], {}),
+        # No axis moves before its command: where Y seems to, X is not late by that.
+        ([in_bands(0.06, 0.06, 0.02, 0.0)], [in_bands(-0.3, -0.3, -0.3, -0.4)], {}),
+        ([in_bands(0.2, 0.2, 0.2, 0.2)], [in_bands(-0.2, -0.2, -0.2, -0.2)], {"x": 0.2}),
         # What lies before the test in a log differs from run to run, even where it looks alike.
         ([in_bands(*4 * [500.0], whole=False)], [in_bands(*4 * [500.2], whole=False)], {}),
         (
