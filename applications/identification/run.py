@@ -16,6 +16,7 @@ from stillpath.applications.identification.figures import IdentificationReport
 from stillpath.applications.identification.report import identification_report
 from stillpath.applications.proof.ring_identification import stops_of
 from stillpath.applications.proof.ring_motion import begins_ring_test
+from stillpath.gcode.errors import GcodeError
 from stillpath.models.complaints import explain
 from stillpath.models.errors import ModelError
 from stillpath.models.friction import usual_guides
@@ -158,7 +159,10 @@ def _with_stops(
     logs = [one.measurement for one in measured if isinstance(one.measurement, AccelerationLog)]
     if not logs:
         raise ModelError(f"{test.name} is a ring test: give what was logged while it ran, too")
-    stops = iter(stops_of(test.content, test.name, logs, base))
+    try:
+        stops = iter(stops_of(test.content, test.name, logs, base))
+    except GcodeError as error:
+        raise ModelError(f"{test.name}: {error}") from None
     found: list[Measured] = []
     for one in measured:
         if isinstance(one.measurement, AccelerationLog):

@@ -43,6 +43,7 @@ __all__ = [
 
 RATE_HZ = 1000.0
 _HEAD_BYTES = 4096
+_LONGEST_S = 900.0
 _HEX = "([0-9a-f]{12})"
 _FAST = 0.95
 """Share of a move's top speed below which it counts as braking."""
@@ -136,7 +137,14 @@ def ring_motion(content: bytes, name: str, machine: Machine) -> RingMotion:
     """Return what `read_ring_motion` does, of a ring test's content; `name` is for messages."""
     rows, numbers = [], []
     motion = TextMotion(BytesIO(content), machine, dialect_for(machine, None), 1.0 / RATE_HZ)
+    samples = 0
     for part in motion:
+        samples += part.samples.xyz_mm.shape[1]
+        if samples > _LONGEST_S * RATE_HZ:
+            raise ModelError(
+                f"{name} lasts more than {_LONGEST_S / 60.0:.0f} minutes, and a ring test two: "
+                "give the file as written"
+            )
         rows.append(part.samples.xyz_mm[:2])
         numbers.append(part.moves.feature[part.samples.move_index - part.first_move])
     names = motion.reader.feature_names

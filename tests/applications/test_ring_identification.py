@@ -164,6 +164,8 @@ def test_reprapfirmware_is_measured_by_its_own_recorder(cache: Path, tmp_path: P
         (("ring",), "ring.gcode is a ring test: give what was logged while it ran, too"),
         (("ring", "ring", "log"), "give one ring test with its logs at a time"),
         (("ring", "other"), "other.csv is not of this file"),
+        (("endless", "log"), "endless.gcode lasts more than 15 minutes, and a ring test two"),
+        (("stuck", "log"), "stuck.gcode: line .*: the move takes .* min at"),
         (
             ("ring", "beginning"),
             "shows 2 stops of X, and 8 are needed: log the whole file",
@@ -178,6 +180,8 @@ def test_what_is_refused(ring: Path, log: InputFile, names: tuple[str, ...], wor
     files = {
         "ring": test_of(ring),
         "log": log,
+        "stuck": InputFile("stuck.gcode", ring.read_bytes() + b"G1 X100 F2\n"),
+        "endless": InputFile("endless.gcode", ring.read_bytes() + b"G1 X100 F6\nG1 X20 F6\n"),
         "other": InputFile("other.csv", noise.raw_data()),
         "beginning": InputFile("beginning.csv", begun.raw_data()),
     }
