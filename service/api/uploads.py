@@ -262,7 +262,8 @@ def _too_large(max_bytes: int) -> Problem:
     return Problem(
         413,
         FILE_TOO_LARGE,
-        f"The upload is larger than {max_bytes} bytes, the limit of this service (of files: "
-        "STILLPATH_MAX_UPLOAD_BYTES).",
+        f"The upload is larger than {max_bytes} bytes ({max_bytes / 1e6:.3g} MB), the most that is "
+        "taken here: is it the right file? For sliced files, whoever runs the service can raise "
+        "STILLPATH_MAX_UPLOAD_BYTES.",
         headers={"Connection": "close"},
     )

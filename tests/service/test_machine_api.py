@@ -319,3 +319,8 @@ def test_a_machine_of_a_config_g(client: TestClient):
 def test_settings_that_are_none_are_refused(client: TestClient, text, query, words):
     assert_problem(settings(client, text, **query), 422, *words)
     assert client.get(MINE).status_code == 404
+
+
+def test_what_is_too_large_to_be_a_document_is_said_in_megabytes(client: TestClient):
+    answer = client.post("/v1/machines/mine/settings", content=b"#" * 4_000_001)
+    assert_problem(answer, 413, "(4 MB)", "right file")
