@@ -137,9 +137,8 @@ def timed(
     sd_s = math.hypot(begins_s, *(logs[0].unsure_s for logs in known.values()))
     later: Axis = "y" if apart_s > 0.0 else "x"
     other = "X" if later == "y" else "Y"
-    expected_s, unsure_s = _expected(abs(apart_s), sd_s)
-    # No axis moves before its command: if the other seems to, this one is not late by that.
-    later_s = min(expected_s, float(np.nanmedian(y_s if later == "y" else x_s)))
+    own_s = _at_most_s(y_s if later == "y" else x_s)
+    later_s, unsure_s = _expected(min(abs(apart_s), own_s), sd_s)
     if not _LEAST_APART_S <= later_s <= _MOST_APART_S:
         return dict(found)
     if not _plants_agree(known[later], x_s if later == "y" else y_s):
@@ -169,6 +168,16 @@ def _expected(told_s: float, sd_s: float) -> tuple[float, float]:
     there_s = share * told_s
     variance = likely * (share * sd_s**2 + (1.0 - likely) * there_s**2)
     return likely * there_s, math.sqrt(variance)
+
+
+def _at_most_s(late_s: Array) -> float:
+    """Return the most by which guides may delay an axis that is so late in its own log, by band.
+
+    No axis moves before its command: if the other seems to, this one is not late by that. And it is
+    slow motion that guides delay: if only faster bands are late, a mode is wrong (docs/tried.md).
+    """
+    known_s = late_s[np.isfinite(late_s)]
+    return max(0.0, min(float(known_s[0]), float(np.median(known_s))))
 
 
 def _agreeing(logs: Sequence[Lateness]) -> list[Lateness]:

@@ -120,6 +120,9 @@ ON_TIME = in_bands(0.3, 0.3, 0.3, 0.3)
         # No axis moves before its command: where Y seems to, X is not late by that.
         ([in_bands(0.06, 0.06, 0.02, 0.0)], [in_bands(-0.3, -0.3, -0.3, -0.4)], {}),
         ([in_bands(0.2, 0.2, 0.2, 0.2)], [in_bands(-0.2, -0.2, -0.2, -0.2)], {"x": 0.2}),
+        # Slow motion is on time: a wrong mode makes the rest late.
+        ([in_bands(0.1, 0.02, 0.03, 0.03)], [in_bands(0.04, 0.63, 0.6, 0.69)], {}),
+        ([in_bands(0.2, 0.0, 0.0, 0.0)], [in_bands(0.5, 0.13, 0.2, 0.14)], {"y": 0.1566667}),
         # What lies before the test in a log differs from run to run, even where it looks alike.
         ([in_bands(*4 * [500.0], whole=False)], [in_bands(*4 * [500.2], whole=False)], {}),
         (
