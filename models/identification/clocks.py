@@ -137,9 +137,10 @@ def timed(
     sd_s = math.hypot(begins_s, *(logs[0].unsure_s for logs in known.values()))
     later: Axis = "y" if apart_s > 0.0 else "x"
     other = "X" if later == "y" else "Y"
+    expected_s, unsure_s = _expected(abs(apart_s), sd_s)
     own_s = _at_most_s(y_s if later == "y" else x_s)
-    later_s, unsure_s = _expected(min(abs(apart_s), own_s), sd_s)
-    if not _LEAST_APART_S <= later_s <= _MOST_APART_S:
+    later_s = min(expected_s, own_s)
+    if own_s < _ALIKE_S or not _LEAST_APART_S <= later_s <= _MOST_APART_S:
         return dict(found)
     if not _plants_agree(known[later], x_s if later == "y" else y_s):
         return dict(found)
