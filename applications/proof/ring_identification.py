@@ -80,11 +80,8 @@ def _read(log: AccelerationLog, motion: RingMotion, predicted: Array) -> _Read:
         felt = read_axis(log, signal, found, motion, row, axis)
         # How well the motion follows is judged with the plants that will be found, not with these.
         reason = unusable(log.source, felt, axis, gains=_GAINS, correlated=_CORRELATED)
-        if felt is not None and not reason and felt.within < _FEWEST_STOPS:
-            reason = (
-                f"{log.source} shows {felt.within} stops of {axis.upper()}, and {_FEWEST_STOPS} "
-                "are needed: log the whole file"
-            )
+        if felt is not None and not reason:
+            reason = _too_few(log, felt, motion, axis)
         if felt is None or reason:
             read.reasons[axis] = reason
         else:
@@ -92,21 +89,34 @@ def _read(log: AccelerationLog, motion: RingMotion, predicted: Array) -> _Read:
     return read
 
 
+def _too_few(log: AccelerationLog, felt: AxisLog, motion: RingMotion, axis: Axis) -> str:
+    if felt.within >= _FEWEST_STOPS and _whole_parts(felt, motion, axis):
+        return ""
+    return (
+        f"{log.source} shows {felt.within} stops of {axis.upper()}, and {_FEWEST_STOPS} are "
+        "needed: log the whole file"
+    )
+
+
 def _stops(
     log: AccelerationLog, felt: AxisLog, motion: RingMotion, axis: Axis, notes: Sequence[str]
 ) -> StopsLog:
-    planned = motion.planned_mm[AXES.index(axis)]
+    return StopsLog(
+        RATE_HZ,
+        motion.planned_mm[AXES.index(axis)],
+        felt.measured,
+        _whole_parts(felt, motion, axis),
+        axis,
+        log.source,
+        (*log.notes, *notes),
+    )
+
+
+def _whole_parts(felt: AxisLog, motion: RingMotion, axis: Axis) -> tuple[tuple[int, int], ...]:
+    """Return the parts of an axis that are in the log from their beginning to their end."""
     parts = [
         (max(first - _LEAD, 0), end)
         for first, end in runs(motion.about[axis])
         if end - first >= _SHORTEST_S * RATE_HZ
     ]
-    return StopsLog(
-        RATE_HZ,
-        planned,
-        felt.measured,
-        tuple((first, end) for first, end in parts if felt.inside[first:end].all()),
-        axis,
-        log.source,
-        (*log.notes, *notes),
-    )
+    return tuple((first, end) for first, end in parts if felt.inside[first:end].all())

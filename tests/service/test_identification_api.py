@@ -13,8 +13,10 @@ from starlette.testclient import TestClient
 
 from stillpath.applications.identification.figures import IdentificationReport
 from stillpath.applications.identification.run import InputFile
+from stillpath.applications.proof.ring_test import write_ring_test
 from stillpath.models.machine import Machine
 from stillpath.models.plants import PairsSpec
+from stillpath.models.typed_in import typed_in
 from stillpath.service.api import create_app
 from stillpath.service.settings import Settings
 from tests.models.identification.recordings import (
@@ -26,6 +28,7 @@ from tests.models.identification.recordings import (
     quick_raw,
 )
 from tests.service.machines import make_machine
+from tests.service.ringing import recorded
 from tests.service.runners import pretend
 from tests.service.test_api import assert_problem
 
@@ -203,3 +206,25 @@ def test_a_damaged_archive_is_told(client: TestClient, data: Path) -> None:
     (file,) = (data / "identifications").iterdir()
     file.write_text("{")
     assert_problem(client.get(f"{MINE}/identification"), 422, file.name, "damaged")
+
+
+@pytest.mark.slow
+def test_a_ring_test_goes_along_with_its_log(
+    client: TestClient, cache: Path, tmp_path: Path
+) -> None:
+    """As the page sends them, of a machine whose resonances were typed in."""
+    axes = {axis: typed_in(f_hz, 0.07) for axis, f_hz in {"x": 52.0, "y": 32.0}.items()}
+    machine = make_machine(kinematics="corexy").model_copy(update={"axes": axes})
+    etag = client.get(MINE).headers["etag"]
+    put = client.put(MINE, content=machine.model_dump_json(), headers={"If-Match": etag})
+    assert put.status_code == 200, put.text
+    ring = tmp_path / "ring.gcode"
+    write_ring_test(machine, ring, cache_dir=cache)
+    log = InputFile("adxl345-ring.csv", recorded(ring, machine).raw_data())
+    alone = post(client, InputFile("ring.gcode", ring.read_bytes()), trial="true")
+    assert_problem(alone, 422, "ring.gcode is a ring test: give what was logged while it ran")
+    answer = post(client, InputFile("ring.gcode", ring.read_bytes()), log)
+    assert answer.status_code == 201, answer.text
+    about = client.get(MINE).json()["axes"]["x"]["provenance"]
+    assert about["kind"] == "ring test"
+    assert [source["name"] for source in about["sources"]] == ["adxl345-ring.csv"]
