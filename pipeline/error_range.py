@@ -42,8 +42,9 @@ _FRICTION_UNSEEN_MM_S2 = 1500.0
 """Dry friction over moving mass that tables may hide: .4 N on .25 kg of rails, 1.5 N on a bed."""
 _LAG_UNSURE_S, _LAG_UNKNOWN_S = 1.5e-4, 4e-4
 """Unknown delay of X against Y: alignment sets both to 0, but viscous guides may delay one; clocks
-of logs tell some of it (`models.identification.clocks`), those of ring tests are not compared
-(on virtual printers one axis follows up to 0.38 ms later)."""
+of logs tell some of it (`models.identification.clocks`), those of ring tests are not compared. Of
+virtual bed slingers one axis follows up to 0.38 ms later, of CoreXY, whose axes hang on the same
+motors, hardly."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +116,8 @@ def _lag_unsure_s(machine: Machine) -> float:
     if any(map(phase_unseen, axes)):
         return 0.0  # such sets include delays
     kinds = {axis.provenance.kind for axis in axes if axis.provenance is not None}
-    return _LAG_UNKNOWN_S if "ring test" in kinds else _LAG_UNSURE_S
+    untold = "ring test" in kinds and machine.kinematics == "cartesian"
+    return _LAG_UNKNOWN_S if untold else _LAG_UNSURE_S
 
 
 def error_ranges(

@@ -105,9 +105,11 @@ class Motion:
         return float(np.sqrt(np.mean(self._distances.at(motion_mm[:, self._at], self._at) ** 2)))
 
 
-def machine_of(f_hz: dict[str, float], friction_mm: float | None = None) -> Machine:
+def machine_of(
+    f_hz: dict[str, float], friction_mm: float | None = None, base: str = "generic-corexy"
+) -> Machine:
     axes = {name: axis(f, friction_mm=friction_mm) for name, f in f_hz.items()}
-    return load_machine("generic-corexy").model_copy(update={"axes": axes})
+    return load_machine(base).model_copy(update={"axes": axes})
 
 
 @pytest.mark.parametrize("f_hz", [{"x": 60.0, "y": 45.0}, {"x": 48.0, "y": 30.0}])
@@ -158,7 +160,7 @@ def test_friction_that_was_found_too_small_counts_in_a_gentle_print_too(
 def test_a_ring_test_does_not_tell_which_axis_follows_later() -> None:
     """One that does by a third of a millisecond prints within the range, not within raw logs'."""
     f_hz = {"x": 60.0, "y": 45.0}
-    machine, motion = machine_of(f_hz), Motion()
+    machine, motion = machine_of(f_hz, base="generic-bedslinger"), Motion()
     command = motion.shaped(machine, f_hz)
     made = printed(printer(f_hz, 0.0), command)
     late = np.arange(made.shape[1]) - 0.35e-3 / DT_S
