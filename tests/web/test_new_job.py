@@ -368,6 +368,8 @@ def test_the_list_has_pages_and_states(visitor: Visitor, service: Service, gear:
     page = visitor.open("#/jobs")
     rows = page.locator(".job-row")
     expect(rows).to_have_count(25)
+    # In the words of the form, not in those of the API.
+    expect(rows.first).to_contain_text("compensated")
     first_page = re.compile(r"/v1/jobs\?limit=25$")
     slow: list[Route] = []
 

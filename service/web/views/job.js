@@ -5,6 +5,7 @@ import { announce } from "../lib/announce.js";
 import { confirmed } from "../lib/dialog.js";
 import { fill, h, keepingFocus } from "../lib/dom.js";
 import { bytes, when } from "../lib/format.js";
+import { methodTitle } from "../lib/methods.js";
 import { problemPanel, retryPanel } from "../lib/problem.js";
 import { isOver, watchJob } from "../lib/watch.js";
 import { stateBadge } from "../parts/state.js";
@@ -98,8 +99,8 @@ function subtitle(job) {
   return [
     h("a", { href: `#/machines/${encodeURIComponent(job.machine)}` }, job.machine),
     job.machine_revision ? h("span", null, " ", h("code", null, job.machine_revision)) : null,
-    options.method === "live" ? " · to be printed live"
-      : ` · ${options.method ?? ""}${options.robust && options.robust !== "auto" ? `, ${options.robust}` : ""} · tolerance ${options.tolerance_um} µm`,
+    options.method === "live" ? ` · ${methodTitle("live")}`
+      : ` · ${methodTitle(options.method)}${options.robust && options.robust !== "auto" ? `, ${options.robust}` : ""} · tolerance ${options.tolerance_um} µm`,
     ` · ${bytes(job.source_bytes)} · ${when(job.created_at)}`,
   ];
 }

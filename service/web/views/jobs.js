@@ -5,6 +5,7 @@ import { announce } from "../lib/announce.js";
 import { confirmed } from "../lib/dialog.js";
 import { fill, focusHeading, h } from "../lib/dom.js";
 import { bytes, duration, um, umOrRange, when } from "../lib/format.js";
+import { methodTitle } from "../lib/methods.js";
 import { problemPanel, retryPanel } from "../lib/problem.js";
 import { isOver, pause } from "../lib/watch.js";
 import { stateBadge } from "../parts/state.js";
@@ -108,7 +109,7 @@ export async function show({ main, signal, setTitle }) {
     return h("li.job-row", { dataset: { job: job.id } },
       h("div.what", null,
         h("a.name", { href: `#/jobs/${job.id}`, dataset: { focus: `open-${job.id}` } }, job.source_name),
-        h("p.hint", null, `${job.machine} · ${job.options?.method ?? ""} · ${bytes(job.source_bytes)} · ${when(job.created_at)}`)),
+        h("p.hint", null, `${job.machine} · ${methodTitle(job.options?.method)} · ${bytes(job.source_bytes)} · ${when(job.created_at)}`)),
       h("div.outcome", null, outcome(job)),
       stateBadge(job.state),
       h("button.quiet", { type: "button", dataset: { focus: `end-${job.id}` }, "aria-label": `${over ? "Delete" : "Cancel"} ${job.source_name}`,

@@ -6,17 +6,12 @@ import { confirmed } from "../lib/dialog.js";
 import { namingControls } from "../lib/controls.js";
 import { fill, h, hide } from "../lib/dom.js";
 import { bytes } from "../lib/format.js";
+import { METHODS } from "../lib/methods.js";
 import { problemPanel } from "../lib/problem.js";
 import { dropZone } from "../parts/drop-zone.js";
 import { machinePicker, rememberMachine, rememberedMachine } from "../parts/machine-picker.js";
 
 const MODELS = /\.(stl|obj|step|stp|amf|ply)$/i;
-const METHODS = [
-  ["", [["fbf", "Compensate"]]],
-  ["Approximate inverses", [["zpetc", "ZPETC"], ["ebzpetc", "Extended-bandwidth ZPETC"], ["ts", "Truncated series"], ["zmetc", "ZMETC"], ["npz-ignore", "NPZ-ignore"]]],
-  ["Firmware shapers", [["shaper:zv", "ZV"], ["shaper:mzv", "MZV"], ["shaper:ei", "EI"], ["shaper:2hump_ei", "2-hump EI"], ["shaper:3hump_ei", "3-hump EI"]]],
-  ["", [["advise", "Advise: moves stay, firmware commands are added"], ["none", "None: measure only"]]],
-];
 const DIALECTS = [["", "The machine's firmware"], ["klipper", "Klipper"], ["marlin", "Marlin"], ["prusa", "Prusa"], ["bambu", "Bambu"], ["reprapfirmware", "RepRapFirmware"]];
 
 /** @param {import("../lib/router.js").Place} place */
