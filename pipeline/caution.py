@@ -57,7 +57,7 @@ Pair: TypeAlias = tuple[DiscretePlant, DiscretePlant]
 Shares: TypeAlias = tuple[float, float]
 """Share of a command in its mixture with the shaper's, for X and Y."""
 
-_VERSION = 16
+_VERSION = 17
 _SHARES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.2, 0.0)
 _UNSEEN_SHARE = 0.85
 """Largest share where the phase was not measured: a set cannot warn of what it does not contain."""

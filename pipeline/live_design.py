@@ -36,7 +36,7 @@ from stillpath.pipeline.measuring.reference_shaper import BestShaper, cached_sha
 __all__ = ["LiveDesign", "cached_live_design", "design_live", "live_filter"]
 
 DT_S = 1e-3
-_VERSION = 7
+_VERSION = 8
 """Part of the cache's name; rises when the design changes."""
 _CORNERS_HZ = (70.0, 90.0, 115.0, 150.0, 200.0, 270.0)
 _REACHES = (80, 160)

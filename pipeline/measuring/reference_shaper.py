@@ -49,7 +49,7 @@ __all__ = [
 ]
 
 _ZETA = 0.1
-_VERSION = 2
+_VERSION = 3
 """Part of the cache's file name; increased when the definition changes."""
 _SHIPPED, _SHIPPED_US = Path(__file__).with_name("reference_shapers.json"), 1000
 _COARSE = 4
