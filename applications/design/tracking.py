@@ -105,15 +105,7 @@ def track(
     plants = _plants(machine, axis, basis, nominal)
     band_hz = machine.axes["x" if axis == "x" else "y"].band_hz
     rest = round(rest_s / _DT_S)
-    y_d = np.pad(path_mm - path_mm[0], (0, rest), mode="edge")
-    if len(y_d) > MOST_SAMPLES:
-        raise DesignError(
-            f"path of {len(path_mm)} ms and {rest} ms of rest: at most {MOST_SAMPLES} ms together; "
-            "cut it, or compensate the print"
-        )
-    scale = float(np.sqrt(np.mean(y_d[: len(path_mm)] ** 2)))
-    if scale == 0.0:
-        raise DesignError(f"the path stays at {path_mm[0]:g} mm: there is nothing to track")
+    y_d, scale = _desired(path_mm, rest)
     m = len(y_d)
     n = functions if functions is not None else _count(basis, band_hz, m)
     design = _designed(plants, m, basis, n, nominal)
@@ -139,6 +131,20 @@ def track(
         robust_error_metric(_set_of(plants, m), controller),
         effort_metric(controller),
     )
+
+
+def _desired(path_mm: Array, rest: int) -> tuple[Array, float]:
+    """Return the path from 0 on, held for `rest` samples at its end, and its rms without these."""
+    y_d = np.pad(path_mm - path_mm[0], (0, rest), mode="edge")
+    if len(y_d) > MOST_SAMPLES:
+        raise DesignError(
+            f"path of {len(path_mm)} ms and {rest} ms of rest: at most {MOST_SAMPLES} ms together; "
+            "cut it, or compensate the print"
+        )
+    scale = float(np.sqrt(np.mean(y_d[: len(path_mm)] ** 2)))
+    if scale == 0.0:
+        raise DesignError(f"the path stays at {path_mm[0]:g} mm: there is nothing to track")
+    return y_d, scale
 
 
 def read_path(file: Path, axis: str) -> Array:

@@ -241,6 +241,7 @@ def mmp(
     """
     nominal = loops[0]
     made = _quiet_predictor(nominal, targets_hz, sensor, alpha, noise_gain)
+    model = CoefficientSet("model", "iir", {"num": nominal.servo_num, "den": nominal.t0_den})
     q = design_q(nominal, targets_hz, shape=shape, bandwidth_hz=bandwidth_hz)
     f = frequency_grid(nominal.dt_s, targets_hz, band_widths(bandwidth_hz, len(targets_hz)))
     add_on = 1.0 - nominal.servo(f) * q.response(2 * np.pi * f * nominal.dt_s) * made.response(f)
@@ -249,11 +250,7 @@ def mmp(
         "mmp",
         (*_compared(nominal, sensor), *made.blocks("dslow", "dhat"), *q.blocks("dhat", "c")),
         Prediction(f, nominal.s0(f), add_on),
-        (
-            made.coefficients(),
-            *q.coefficients(),
-            CoefficientSet("model", "iir", {"num": nominal.servo_num, "den": nominal.t0_den}),
-        ),
+        (made.coefficients(), *q.coefficients(), model),
         noise_gain=made.noise_gain,
         sensor=sensor,
         settings={

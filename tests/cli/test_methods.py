@@ -75,10 +75,10 @@ def test_the_api_names_them_all():
 
 
 def test_the_page_offers_them_all():
-    script = (ROOT / "service/web/views/new-job.js").read_text()
-    block = script.split("const METHODS = [", 1)[1].split("];\n", 1)[0]
+    methods = (ROOT / "service/web/lib/methods.js").read_text()
+    block = methods.split("const METHODS = [", 1)[1].split("];\n", 1)[0]
     assert set(re.findall(r'\["([^"]+)", "', block)) == ALL - {"live"}
-    assert 'method: "live"' in script
+    assert 'method: "live"' in (ROOT / "service/web/views/new-job.js").read_text()
 
 
 def test_cura_offers_all_that_write_a_file():
@@ -107,12 +107,13 @@ def test_every_place_has_the_same_defaults():
 
 def test_the_page_offers_the_defaults_first():
     script = (ROOT / "service/web/views/new-job.js").read_text()
+    methods = (ROOT / "service/web/lib/methods.js").read_text()
     usual = Options()
     for name in ("basis", "robust", "where", "times"):
         first = re.search(rf'const {name} = select\("{name}", \[\["", \[\["([^"]+)", ', script)
         assert first is not None
         assert first[1] == getattr(usual, name)
-    assert script.split("const METHODS = [", 1)[1].split('["', 3)[2].startswith(f'{usual.method}"')
+    assert methods.split("const METHODS = [", 1)[1].split('["', 3)[2].startswith(f'{usual.method}"')
     along = re.search(r'id: "along",.*placeholder: "([^"]+)"', script)
     assert along is not None
     compensator = PreviewFbf(load_machine("generic-corexy"), 1e-3, along=usual.along)

@@ -319,7 +319,9 @@ def test_a_log_of_m956(name: str) -> None:
     ringing = 0.3 * np.exp(-np.arange(3000) / 300) * np.sin(np.arange(3000) * 0.2)
     rows = "".join(f"{i},{v:.3f}\n" for i, v in enumerate(ringing))
     file = InputFile(name, f"Sample,X\n{rows}Rate 1600, overflows 0\n".encode())
-    with pytest.raises(ModelError, match=rf"^{name}: RepRapFirmware has no resonance test.*verify"):
+    with pytest.raises(
+        ModelError, match=rf"^{name}: RepRapFirmware has no resonance test.*ring-test"
+    ):
         one(file)
 
 
