@@ -67,7 +67,8 @@ def test_hostile_files_at_all_routes_that_compute(tmp_path: Path) -> None:
     with server(PRETEND, tmp_path) as (client, process), ThreadPoolExecutor(24) as pool:
         assert client.post(MEASUREMENTS, **spectrum(100)).status_code in (200, 422)
         done = finished(client, post(client, b"stamp"))
-        resource.prlimit(process.pid, resource.RLIMIT_DATA, (600 * MIB,) * 2)
+        # 170 MB of libraries, and 40 threads with 8 MB of stack each, before any request.
+        resource.prlimit(process.pid, resource.RLIMIT_DATA, (750 * MIB,) * 2)
         with watched(client, process) as seen:
             job = post(client, b"nap 5")
             asked = hostile_requests(client, done["links"]["trajectories"])
