@@ -40,7 +40,6 @@ from scipy.signal import ss2zpk
 from stillpath.applications.machines.envelope import derived_envelope
 from stillpath.models.arrays import Array
 from stillpath.models.errors import ModelError
-from stillpath.models.firmware.klipper import Klipper
 from stillpath.models.friction import DryFriction, usual_guides
 from stillpath.models.identification.identify import Measured, identify
 from stillpath.models.identification.readers import ReadSettings, read_content
@@ -88,6 +87,7 @@ class Task:
     belts: float = 1.0
     friction: float = 1.0
     options: Options = field(default_factory=Options)
+    ring_accel_mm_s2: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,7 +151,10 @@ def main() -> int:
     parser.add_argument(
         "--max-accel-mm-s2",
         type=float,
-        help="of printer.cfg; the motors bear what follows from it (default: the built-in limits)",
+        help="of the configuration, from which motors' limits follow (default: the built-in ones)",
+    )
+    parser.add_argument(
+        "--ring-accel-mm-s2", type=float, help="of ring tests (default: the configuration's)"
     )
     parser.add_argument("--firmware", choices=("klipper", *OTHERS), default="klipper")
     parser.add_argument("--load-kg", type=float, default=0.0, help="on the bed, after measuring")
@@ -187,6 +190,7 @@ def main() -> int:
                 given.belts,
                 given.friction,
                 Options(tolerance_um=given.tolerance_um),
+                given.ring_accel_mm_s2,
             )
             for seed in range(given.first, given.first + given.printers)
             for kind in KINDS
@@ -236,10 +240,11 @@ def judged(task: Task) -> list[Row]:
     """Measure, identify and print on one printer."""
     printer = rubbing(draw(task.kind, task.seed), task.friction)
     rng = np.random.default_rng([KINDS.index(task.kind), task.seed, 1])
-    base = limited(load_machine(BASES[task.kind]), task.max_accel_mm_s2)
+    base = load_machine(BASES[task.kind])
     if task.firmware != "klipper":
         base = machine_with(BASES[task.kind], task.firmware, _STEPS_PER_MM, min_steps=_MIN_STEPS)
-    machine, shapers, note = identified(printer, base, task.source, rng)
+    base = limited(base, task.max_accel_mm_s2)
+    machine, shapers, note = identified(printer, base, task, rng)
     printer = changed(printer, task.load_kg, task.belts)
     rows = []
     for file in task.files:
@@ -297,24 +302,23 @@ def changed(printer: Printer, load_kg: float, belts: float) -> Printer:
 
 
 def limited(base: Machine, max_accel_mm_s2: float | None) -> Machine:
-    """Return the machine that a printer.cfg with such an acceleration leads to."""
+    """Return the machine that a configuration with such an acceleration leads to."""
     if max_accel_mm_s2 is None:
         return base
-    assert isinstance(base.firmware, Klipper)
-    planner = base.firmware.planner.model_copy(update={"max_accel_mm_s2": max_accel_mm_s2})
-    firmware = base.firmware.model_copy(update={"planner": planner})
+    firmware = base.firmware.driven_at(max_accel_mm_s2)
     machine = base.model_copy(update={"firmware": firmware})
     return machine.model_copy(update={"command": derived_envelope(machine)})
 
 
 def identified(
-    printer: Printer, base: Machine, source: str, rng: np.random.Generator
+    printer: Printer, base: Machine, task: Task, rng: np.random.Generator
 ) -> tuple[Machine | None, list[tuple[str, float]], str]:
     """Return the machine that the measurement leads to, and the shapers of X and Y.
 
     Where resonances are typed in, they are those of ZV shapers that Klipper tunes; so are those
     that a ring test begins with. A machine that is refused prints with the shaper.
     """
+    source = task.source
     sensor = drawn_sensor(rng)
     test = OLD_TEST if rng.random() < 0.5 else NEW_TEST
     settings = ReadSettings(
@@ -348,7 +352,9 @@ def identified(
     try:
         if source == "ring":
             with tempfile.TemporaryDirectory(prefix="stillpath-ring-") as folder:
-                made = identified_from_stops(printer, machine, sensor, rng, Path(folder))
+                made = identified_from_stops(
+                    printer, machine, sensor, rng, Path(folder), task.ring_accel_mm_s2
+                )
             return made, shapers, ""
         found = identify(measured, settings)
     except ModelError as error:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from stillpath.applications.identification.run import InputFile, identify_files
+from stillpath.applications.proof.recorders import RingSettings
 from stillpath.applications.proof.ring_test import write_ring_test
 from stillpath.models.machine import Machine
 from stillpath.pipeline.file_dialect import dialect_for
@@ -28,13 +29,14 @@ def identified_from_stops(
     sensor: Accelerometer,
     rng: np.random.Generator,
     folder: Path,
+    accel_mm_s2: float | None = None,
 ) -> Machine:
     """Return the machine that a ring test of a machine with typed-in resonances leads to.
 
     The sensor of a bed slinger is on the head, then, in a second run, on the bed.
     """
     ring = folder / "ring.gcode"
-    write_ring_test(typed, ring, cache_dir=folder)
+    write_ring_test(typed, ring, RingSettings(accel_mm_s2=accel_mm_s2), cache_dir=folder)
     with ring.open("rb") as file:
         motion = TextMotion(file, typed, dialect_for(typed, None), STEP_S)
         command = np.concatenate([part.samples.xyz_mm[:2] for part in motion], axis=1)

@@ -119,6 +119,16 @@ def ring_test(
         str | None, typer.Option("--chip-y", help="The one that moves with Y, if it is another.")
     ] = None,
     start_gcode: StartGcode = None,
+    accel: Annotated[
+        float | None,
+        typer.Option(
+            "--accel-mm-s2",
+            min=100.0,
+            max=50_000.0,
+            help="Acceleration of the stops; motors must bear 1.5 times it, and up to 2000 with "
+            "Marlin and RepRapFirmware 3 times. [default: the firmware's]",
+        ),
+    ] = None,
 ) -> None:
     """Write stops for an accelerometer, half as planned, half compensated. Nothing is printed."""
     target = check_output(output, machine, start_gcode)
@@ -130,7 +140,7 @@ def ring_test(
     from stillpath.cli.proof_tables import print_proof
     from stillpath.models.typed_in import stated_hz
 
-    settings = RingSettings(chip, chip_y, _text(start_gcode))
+    settings = RingSettings(chip, chip_y, _text(start_gcode), accel)
     with progress_shown() as progress:
         made = write_ring_test(found.machine, target, settings, progress=progress)
     print_proof(made, found.warnings)

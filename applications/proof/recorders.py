@@ -40,11 +40,14 @@ class RingSettings:
         ACCELEROMETER_MEASURE, P of M956. None: the firmware's default; the same for Y as for X.
     start_gcode : str, optional
         Instead of the line that homes.
+    accel_mm_s2 : float, optional
+        Acceleration of the stops, instead of the firmware's for X and Y.
     """
 
     chip_x: str | None = None
     chip_y: str | None = None
     start_gcode: str | None = None
+    accel_mm_s2: float | None = None
 
 
 class Recorder:

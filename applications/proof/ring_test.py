@@ -14,12 +14,14 @@ from typing import Literal
 
 import numpy as np
 
+from stillpath.applications.machines.envelope import derived_envelope
 from stillpath.applications.proof.drive import AXES, Axis, RingingMode, ringing_mode
 from stillpath.applications.proof.halves import ProofPrint, Ringing, write_proof
 from stillpath.applications.proof.recorders import RingSettings, recorder_for
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.models.confirmation import plants_digest
 from stillpath.models.errors import ModelError
+from stillpath.models.firmware import Klipper
 from stillpath.models.machine import Machine
 from stillpath.pipeline.progress import ProgressCallback
 from stillpath.pipeline.result import Result
@@ -74,6 +76,8 @@ class RingTest:
     """
 
     def __init__(self, machine: Machine, settings: RingSettings) -> None:
+        self._own_limits = adapter(machine).initial_limits()
+        self.machine = machine = _driven(machine, settings.accel_mm_s2)
         self._machine, self._settings = machine, settings
         self._firmware_adapter = adapter(machine)
         self._stream_commands = self._firmware_adapter.stream_commands()
@@ -103,9 +107,12 @@ class RingTest:
         self._add(*(["G28"] if start is None else start.splitlines()))
         self._add("; STILLPATH_OFF", "G90", "M83", "M220 S100")
         # Both halves are predicted and measured without the firmware's shaper.
-        self._add(*self._stream_commands.shaper_off.decode().splitlines())
+        self._limit(self._stream_commands.shaper_off)
         largest = self._machine.firmware.largest_accel_mm_s2
-        self._add(*self._stream_commands.acceleration(largest).decode().splitlines())
+        self._limit(self._stream_commands.acceleration(largest))
+        if self._settings.accel_mm_s2 is not None:
+            raised = self._firmware_adapter.initial_limits()
+            self._limit(self._stream_commands.axis_accelerations(raised))
         travel = self._machine.travel["z"]
         height_mm = min(max(travel.min_mm, 0.0) + _HEIGHT_MM, self._middle["z"])
         self._add(f"G1 Z{height_mm:.3f} F{60 * self._z_mm_s:.0f}")
@@ -126,8 +133,10 @@ class RingTest:
             self._centre()
             self._add(*self.recorder.after(seconds))
         self._add(*self.recorder.last())
-        own = self._stream_commands.acceleration_back(self._firmware_adapter.initial_limits())
-        self._add(*(own + (self._stream_commands.shaper_on or b"")).decode().splitlines())
+        if self._settings.accel_mm_s2 is not None:
+            self._limit(self._stream_commands.axis_accelerations(self._own_limits))
+        self._limit(self._stream_commands.acceleration_back(self._own_limits))
+        self._limit(self._stream_commands.shaper_on or b"")
 
     def _stops(self, half: Literal["off", "on"]) -> float:
         """Move each axis back and forth at every speed; return the approximate duration.
@@ -186,6 +195,9 @@ class RingTest:
         self._add(f"G1 X{x:.3f} Y{y:.3f} F{60 * self._travel_mm_s:.0f}")
         self._add(f"G4 P{1e3 * _REST_S[0]:.0f}")
 
+    def _limit(self, lines: bytes) -> None:
+        self._add(*lines.decode().splitlines())
+
     def _add(self, *lines: str) -> None:
         self._out.extend(lines)
 
@@ -234,11 +246,48 @@ def write_ring_test(
             f"Nothing is printed, nothing is heated: the head stops dead from {', '.join(stops)},",
             "half of the times as planned, half compensated. Do not touch machine or table.",
             *program.recorder.instruction,
+            *_raised(settings.accel_mm_s2),
             ", ".join(plants_line(a, plants_digest(machine.axes[a])) for a in AXES),
             f"Time {result.time_s:.0f} s without homing.",
         ]
 
-    return write_proof(program, machine, target, legend, cache_dir=cache_dir, progress=progress)
+    driven = program.machine
+    return write_proof(program, driven, target, legend, cache_dir=cache_dir, progress=progress)
+
+
+def _driven(machine: Machine, accel_mm_s2: float | None) -> Machine:
+    """Return the machine with this acceleration, and motors that bear as much as it needs.
+
+    Raises
+    ------
+    ModelError
+        The printer does not take limits above its own.
+    """
+    if accel_mm_s2 is None:
+        return machine
+    firmware, own = machine.firmware, machine.command
+    if isinstance(firmware, Klipper) and firmware.limits_capped:
+        most = min(firmware.allowance(axis).accel_mm_s2 for axis in AXES)
+        if accel_mm_s2 > most:
+            raise ModelError(
+                f"the stops cannot brake with {accel_mm_s2:g} mm/s2 (--accel-mm-s2): this printer "
+                f"takes no more than its own {most:g}; leave it out"
+            )
+    driven = machine.model_copy(update={"firmware": firmware.driven_at(accel_mm_s2)})
+    needed = derived_envelope(driven)
+    if own.every_way.accel_mm_s2 >= needed.every_way.accel_mm_s2:
+        return driven
+    kept = {name: getattr(own, name) for name in ("velocity_mm_s", "speed_step_mm_s")}
+    return driven.model_copy(update={"command": needed.model_copy(update=kept)})
+
+
+def _raised(accel_mm_s2: float | None) -> list[str]:
+    if accel_mm_s2 is None:
+        return []
+    return [
+        f"Accelerations are set to {accel_mm_s2:g} mm/s2 until the end: if you cancel, restart the",
+        "firmware, or set them back. Motors that clack or stay behind do not bear it.",
+    ]
 
 
 def region(axis: Axis, part: str) -> str:

@@ -197,6 +197,9 @@ class StreamCommands(Protocol):
     def acceleration(self, accel_mm_s2: float) -> bytes:
         """Lines that limit the acceleration of X and Y and leave all other limits alone."""
 
+    def axis_accelerations(self, limits: Limits) -> bytes:
+        """Lines that limit X and Y each; empty where `acceleration` is the only limit."""
+
     def acceleration_back(self, limits: Limits) -> bytes:
         """Lines that put back what those of `acceleration` have changed."""
 

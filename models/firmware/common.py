@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Self
 
 from pydantic import model_validator
 
@@ -119,6 +119,10 @@ class FirmwareFacts(Document):
         By default that of the head, in whatever direction.
         """
         return math.sqrt(2.0) * self.largest_accel_mm_s2
+
+    def driven_at(self, accel_mm_s2: float) -> Self:
+        """Return the same firmware with this as its acceleration of X and Y."""
+        raise NotImplementedError
 
     @property
     def fastest_z_mm_s(self) -> float:

@@ -125,6 +125,11 @@ class Klipper(FirmwareFacts):
             )
         return self
 
+    def driven_at(self, accel_mm_s2: float) -> Klipper:
+        """Return the same firmware with this as its acceleration of X and Y."""
+        planner = self.planner.model_copy(update={"max_accel_mm_s2": accel_mm_s2})
+        return self.model_copy(update={"planner": planner})
+
     @property
     def hotend(self) -> Hotend:
         """Nozzle and filament."""

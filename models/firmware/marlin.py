@@ -212,6 +212,16 @@ class Marlin(FirmwareFacts):
             corner = getattr(planner.jerk_mm_s, axis)
         return AxisAllowance(getattr(planner.max_feedrate_mm_s, axis), accel, corner, travel)
 
+    def driven_at(self, accel_mm_s2: float) -> Marlin:
+        """Return the same firmware with this as its acceleration of X and Y."""
+        most = self.planner.max_accel_mm_s2.model_copy(update={"x": accel_mm_s2, "y": accel_mm_s2})
+        changed = {
+            "max_accel_mm_s2": most,
+            "accel_mm_s2": accel_mm_s2,
+            "travel_accel_mm_s2": accel_mm_s2,
+        }
+        return self.model_copy(update={"planner": self.planner.model_copy(update=changed)})
+
     def motor_accel_mm_s2(self) -> float:
         """Return what M201 leaves of the acceleration of a diagonal: it holds for motors."""
         planner, limit = self.planner, self.planner.max_accel_mm_s2

@@ -114,6 +114,17 @@ class RepRapFirmware(FirmwareFacts):
         )
         return AxisAllowance(drive.max_speed_mm_s, accel, drive.jerk_mm_s, travel)
 
+    def driven_at(self, accel_mm_s2: float) -> RepRapFirmware:
+        """Return the same firmware with this as its acceleration of X and Y."""
+        most = {"max_accel_mm_s2": accel_mm_s2}
+        changed = {
+            "x": self.x.model_copy(update=most),
+            "y": self.y.model_copy(update=most),
+            "print_accel_mm_s2": accel_mm_s2,
+            "travel_accel_mm_s2": accel_mm_s2,
+        }
+        return self.model_copy(update=changed)
+
     def motor_accel_mm_s2(self) -> float:
         """Return what M201 leaves of the acceleration of a diagonal: it holds for motors, too."""
         least = min(self.x.max_accel_mm_s2, self.y.max_accel_mm_s2)

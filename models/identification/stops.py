@@ -6,8 +6,8 @@ response is known from 4 Hz to beyond the modes, with its phase but for the cloc
 clock's rate was matched with plants that are not known yet; the right one explains most.
 
 Where the axis reverses, dry friction holds it back on the other side. The stops are so short that
-what rings reverses it, too, so the bend of the guides follows the motion as it was measured. Its
-size is the one that leaves the smallest residual.
+what rings reverses it, too, so the bend of the guides follows the motion as it was felt. Its size
+is the one that leaves the smallest residual.
 """
 
 from __future__ import annotations
@@ -47,8 +47,16 @@ _COMPARED_HZ, _COMPARED_STEP_HZ, _COMPARED_HALF_BAND_HZ = (5.0, 60.0), 0.5, 2.0
 _RATES = 2e-5 * np.arange(-25, 26)
 """Errors of the clock's rate that are tried: a millisecond in 50 s apart."""
 _LEAST_FOLLOWED = 0.15
+_KNOWN = 0.08
+"""Standard deviation over response with which a frequency counts as coherent. Above 30 Hz gentle
+stops shake an axis little, so that one of them says little, and all of them say it dozens of
+times: a coherence of 0.95 would leave most of what is known out."""
 _SLOW_HZ, _LEVELS = 12.0, (0.6, 1.6)
 """A sensor may be 16 % off, and a frame excited by reaction adds up to about 30 %."""
+_SHAKES = 0.4
+"""Damping of a frame, at most: feet have 0.1 to 0.25."""
+_RINGS_HZ, _STEEPNESS = 12.0, 8
+"""From where on the bend of the guides follows the motion as it was felt."""
 _ROUNDS = 2
 """The bend of the guides follows a motion that is the better known the less friction is in it."""
 
@@ -94,17 +102,22 @@ def responses_of_stops(
     held_mm, frame = 0.0, None
     for _ in range(_ROUNDS):
         felt = [_response(*row) for row in zip(logs, received, labels, strict=True)]
-        frame = None if frame_firm else frame_of(felt, near=frame)
-        over_bed = felt if frame is None else [frame.over_bed(one) for one in felt]
-        bends = [_bend(log, one) for log, one in zip(logs, over_bed, strict=True)]
+        frame = None if frame_firm else _frame_of(felt, frame)
+        bends = [_bend(log, one, frame) for log, one in zip(logs, felt, strict=True)]
         held_mm = _held_mm(logs, bends)
         received = [log.command_mm - held_mm * b for log, b in zip(logs, bends, strict=True)]
     felt = [_response(*row) for row in zip(logs, received, labels, strict=True)]
-    frame = None if frame_firm else frame_of(felt, near=frame)
+    frame = None if frame_firm else _frame_of(felt, frame)
     over_bed = felt if frame is None else [frame.over_bed(one) for one in felt]
     for one in over_bed:
         _check_followed(one)
     return Stopped([_from_start(one) for one in over_bed], held_mm, frame)
+
+
+def _frame_of(felt: Sequence[FrequencyResponse], near: Frame | None) -> Frame | None:
+    """Return the frame that shakes, unless it hardly does: what friction leaves looks like that."""
+    frame = frame_of(felt, near=near)
+    return None if frame is None or frame.zeta > _SHAKES else frame
 
 
 def _response(log: StopsLog, received_mm: Array, label: str) -> FrequencyResponse:
@@ -118,12 +131,18 @@ def _response(log: StopsLog, received_mm: Array, label: str) -> FrequencyRespons
         f_hz,
         found.response * undone,
         found.sd * undone,
-        found.coherence,
+        _as_coherence(found),
         axis=log.axis,
         label=label,
         source=log.source,
         notes=log.notes,
     )
+
+
+def _as_coherence(found: LocalResponse) -> Array:
+    """Return the coherence that stands for how well the response is known, shape (n,)."""
+    unsure = found.sd / np.maximum(np.abs(found.response), 1e-12) / _KNOWN
+    return np.asarray(1.0 / (1.0 + (1.0 / LEAST_COHERENCE - 1.0) * unsure**2), np.float64)
 
 
 def _on_time(log: StopsLog) -> StopsLog:
@@ -167,15 +186,28 @@ def _transformed(command: Array, measured: Array, rate_hz: float) -> Transformed
     return Transformed(rate_hz / size, u, y)
 
 
-def _bend(log: StopsLog, response: FrequencyResponse) -> Array:
-    """Return the bend of the guides along the motion as it was measured, shape (n,), -1 to 1."""
+def _bend(log: StopsLog, felt: FrequencyResponse, frame: Frame | None) -> Array:
+    """Return the bend of the guides along the motion as it was, shape (n,), -1 to 1.
+
+    What rings is as it was felt, because friction bends it; below `_RINGS_HZ` a sensor's noise,
+    integrated twice, is micrometres, and the axis is where the response says.
+    """
     n = len(log.command_mm)
     size = next_fast_len(2 * n, real=True)
     f_hz = rfftfreq(size, 1.0 / log.rate_hz)
-    on_time = _from_start(response)
-    accel = np.pad(np.diff(log.command_mm, 2), 1)
-    s_squared = -((2.0 * np.pi * np.maximum(f_hz, f_hz[1]) / log.rate_hz) ** 2)
-    more = beyond_slow(on_time, f_hz) / s_squared * rfft(accel, size)
+    over_bed = felt if frame is None else frame.over_bed(felt)
+    known = felt.coherence >= LEAST_COHERENCE
+    delay_s = low_frequency_delay(felt.f_hz[known], felt.response[known]) if known.any() else 0.0
+    level = float(np.median(np.abs(over_bed.response[felt.f_hz <= _SLOW_HZ])))
+    w_s = 2.0 * np.pi * np.maximum(f_hz, f_hz[1]) / log.rate_hz
+    accel = rfft(np.pad(np.diff(log.command_mm, 2), 1), size)
+    by_response = beyond_slow(_from_start(over_bed), f_hz) * accel
+    measured = rfft(log.measured_mm_s2 / log.rate_hz**2, size) * np.exp(2j * np.pi * f_hz * delay_s)
+    if frame is not None:
+        measured = measured * (1 + frame.reaction(f_hz))
+    as_felt = measured * np.sinc(f_hz / log.rate_hz) ** 2 / level - accel
+    rings = 1.0 / (1.0 + (_RINGS_HZ / np.maximum(f_hz, f_hz[1])) ** _STEEPNESS)
+    more = -(rings * as_felt + (1.0 - rings) * by_response) / w_s**2
     return bend_of(log.command_mm + irfft(more, size)[:n], 1.0 / log.rate_hz)
 
 
@@ -214,8 +246,8 @@ def _check_followed(response: FrequencyResponse) -> None:
     share = float(np.mean(response.coherence >= LEAST_COHERENCE))
     if share < _LEAST_FOLLOWED:
         raise ModelError(
-            f"{response.source}: the motion follows the ring test at only {share:.0%} of its "
-            f"frequencies (coherence of at least {LEAST_COHERENCE}; at least {_LEAST_FOLLOWED:.0%} "
-            "are needed): the sensor is too noisy or loose, or the file was printed with other "
-            "limits than the machine says; look at both, and log the ring test again"
+            f"{response.source}: the response is known within {_KNOWN:.0%} at only {share:.0%} of "
+            f"the frequencies (at least {_LEAST_FOLLOWED:.0%} are needed): the stops were too "
+            "gentle, the sensor is noisy or loose, or the file was printed with other limits than "
+            "the machine says; look at these, and log a ring test with a larger --accel-mm-s2"
         )

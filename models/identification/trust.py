@@ -296,5 +296,5 @@ def _check_gap(one: FrequencyResponse, follows: NDArray[np.bool_], names: str) -
         f"Hz (coherence below {LEAST_COHERENCE:g}; at most a factor of {_WIDEST_GAP:g} may lie "
         "between frequencies that it follows): a resonance there was not measured. An axis whose "
         "guides rub much sticks while it is driven so little: look for what rubs or is loose, or "
-        "test with a larger accel_per_hz, and measure again"
+        "test with a larger accel_per_hz (ring-test: --accel-mm-s2), and measure again"
     )

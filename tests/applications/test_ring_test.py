@@ -16,8 +16,9 @@ from stillpath.applications.machines.envelope import with_firmware
 from stillpath.applications.proof.confirming import verify_ring
 from stillpath.applications.proof.recorders import RingSettings
 from stillpath.applications.proof.ring_figures import RingReport
-from stillpath.applications.proof.ring_motion import is_ring_test, read_ring_motion
+from stillpath.applications.proof.ring_motion import is_ring_test, read_ring_motion, ring_motion
 from stillpath.applications.proof.ring_test import (
+    AXES,
     TITLE,
     RingTest,
     plants_line,
@@ -151,6 +152,40 @@ def test_other_firmwares_have_ring_tests(
     write_ring_test(made, tmp_path / "ring.gcode", cache_dir=cache)
     motion = read_ring_motion(tmp_path / "ring.gcode", made)
     assert len(motion.of("y", compensated=True)) == 12
+
+
+@pytest.mark.parametrize("kind", ["klipper", "marlin", "reprapfirmware"])
+def test_stops_may_be_harder_than_the_firmware_would_make_them(
+    kind: str, machine: Machine, cache: Path, tmp_path: Path
+) -> None:
+    """Of what comes after them nothing is."""
+    if kind != "klipper":
+        machine = with_firmware(machine, json.loads((EXAMPLES / f"{kind}.json").read_text()))
+    allowed = machine.firmware.allowance("x")
+    asked_mm_s2 = 2.0 * allowed.accel_mm_s2
+    path = tmp_path / "ring.gcode"
+    write_ring_test(machine, path, RingSettings(accel_mm_s2=asked_mm_s2), cache_dir=cache)
+    motion = read_ring_motion(path, machine)
+    for k, axis in enumerate(AXES):
+        for stop in motion.of(axis, compensated=False):
+            braking = motion.planned_mm[k, round(1e3 * stop.from_s) : round(1e3 * stop.at_s)]
+            # Marlin's ramps of whole steps are a fifth steeper.
+            assert ramp_mm_s2(braking) == pytest.approx(asked_mm_s2, rel=0.25)
+    behind = path.read_bytes() + b"G1 X60 Y150 F9000\nG1 X160\nG1 X60\n"
+    ends = ring_motion(behind, "longer", machine).planned_mm[0, -1500:]
+    assert ramp_mm_s2(ends) == pytest.approx(allowed.travel_accel_mm_s2, rel=0.1)
+
+
+def ramp_mm_s2(position_mm: np.ndarray) -> float:
+    """Acceleration along a ramp, sampled each ms: not the largest, since corners step."""
+    accels = 1e6 * np.abs(np.diff(position_mm, 2))
+    return float(np.median(accels[accels > 500.0]))
+
+
+def test_a_printer_that_takes_no_higher_limit_has_no_harder_stops(machine: Machine) -> None:
+    capped = machine.firmware.model_copy(update={"limits_capped": True})
+    with pytest.raises(ModelError, match=r"with 9000 mm/s2 .* takes no more than its own"):
+        RingTest(machine.model_copy(update={"firmware": capped}), RingSettings(accel_mm_s2=9000.0))
 
 
 @pytest.mark.slow

@@ -109,6 +109,10 @@ class KlipperStreamCommands:
         """Return the line that sets the acceleration."""
         return f"SET_VELOCITY_LIMIT ACCEL={accel_mm_s2:g}\n".encode()
 
+    def axis_accelerations(self, limits: Limits) -> bytes:  # noqa: ARG002
+        """Return nothing: Klipper has one acceleration."""
+        return b""
+
     def acceleration_back(self, limits: Limits) -> bytes:
         """Return the line that sets the limits' acceleration."""
         return self.acceleration(cast(KlipperLimits, limits).accel_mm_s2)

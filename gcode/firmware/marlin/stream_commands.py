@@ -154,6 +154,12 @@ class MarlinStreamCommands:
         accel = _number(float(f"{accel_mm_s2:g}"))
         return f"M204 P{accel} T{accel}\n".encode()
 
+    def axis_accelerations(self, limits: Limits) -> bytes:
+        """Return M201 of X and Y."""
+        own = cast(MarlinLimits, limits)
+        x, y = _number(own.accel_x_mm_s2), _number(own.accel_y_mm_s2)
+        return f"M201 X{x} Y{y}\n".encode()
+
     def acceleration_back(self, limits: Limits) -> bytes:
         """Return the line that sets the limits' accelerations of these moves."""
         own = cast(MarlinLimits, limits)

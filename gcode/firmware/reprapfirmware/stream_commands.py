@@ -104,6 +104,12 @@ class RepRapStreamCommands:
         accel = _number(accel_mm_s2)
         return f"{_FENCE}\nM204 P{accel} T{accel}\n".encode()
 
+    def axis_accelerations(self, limits: Limits) -> bytes:
+        """Return M201 of X and Y."""
+        own = cast(RepRapLimits, limits)
+        words = _words(own, "accel_{}_mm_s2", 1.0, ["x", "y"])
+        return f"{_FENCE}\nM201{words}\n".encode()
+
     def acceleration_back(self, limits: Limits) -> bytes:
         """Return the line that sets the limits' M204."""
         own = cast(RepRapLimits, limits)
