@@ -15,7 +15,7 @@ from tests.web.served import PART, Service
 from tests.web.visitor import Visitor
 
 PHONE = {"width": 390, "height": 844}
-VIEWS = ["new", "jobs", "job", "machines", "machine", "own"]
+VIEWS = ["new", "jobs", "job", "machines", "machine", "own", "help"]
 
 
 @pytest.fixture(scope="module")
@@ -29,6 +29,7 @@ def show(service: Service, gear: dict[str, Any]) -> Callable[..., Page]:
         "machines": ("#/machines", ".cards"),
         "machine": ("#/machines/annex-k3", ".plot canvas"),
         "own": ("#/machines/shown", ".row-actions"),
+        "help": ("help/running", ".help table"),
     }
 
     def opened(visitor: Visitor, view: str, **options: Any) -> Page:
@@ -83,6 +84,7 @@ def test_large_letters_need_no_sideways_scrolling(visitor: Visitor, service: Ser
         ("#/jobs", ".job-row"),
         ("#/machines", ".cards"),
         (f"#/jobs/{job['id']}", "text=Filter for Klipper"),
+        ("help/dialects", ".help table"),
     ):
         page.goto(f"{visitor.url}/{view}")
         page.locator(there).first.wait_for()
@@ -161,9 +163,13 @@ def test_the_page_works_below_a_path_of_a_proxy(
     page.route("**/*", pass_on)
     page.goto(f"{below}/#/jobs/{gear['id']}")
     page.locator(".stage[data-renderer]:not([aria-busy])").wait_for()
-    links = page.locator("a[download], a[target=_blank]")
+    links = page.locator("a[download], .downloads a[target=_blank]")
     for link in links.evaluate_all("links => links.map(a => a.href)"):
         assert link.startswith(f"{below}/v1/jobs/{gear['id']}/"), link
+    for link in page.get_by_role("link", name="docs/").evaluate_all(
+        "links => links.map(a => a.href)"
+    ):
+        assert link.startswith(f"{below}/help/"), link
     with page.expect_download() as download:
         page.get_by_role("link", name="G-code").click()
     assert download.value.url == f"{below}/v1/jobs/{gear['id']}/result"

@@ -1,6 +1,7 @@
 /** The machines that jobs can name: one's own first, then those that are built in. */
 
 import { getJson } from "../lib/api.js";
+import { helpLink } from "../lib/controls.js";
 import { fill, h } from "../lib/dom.js";
 import { measurementPanel } from "../machine/measurement.js";
 import { settingsPanel } from "../machine/settings.js";
@@ -25,7 +26,7 @@ export async function show({ main, signal, setTitle }) {
     h("p.lead", null, "A compensator is only as good as its model of the machine. Each built-in machine is one printer that somebody measured, and yours is different."),
     list,
     h("section", null, h("h2", null, "Make your own from the printer's settings"),
-      h("p.hint", null, "Limits and travel come from the firmware. How the frame rings is measured afterwards, on the machine's page."),
+      h("p.hint", null, "Limits and travel come from the firmware. How the frame rings is measured afterwards, on the machine's page: ", helpLink("identification", "how"), "."),
       settingsPanel({ machine: null, machines, signal })),
     h("section", null, h("h2", null, "Or from measurements, with another machine's limits"),
       measurementPanel({ machines, base: null, signal })));

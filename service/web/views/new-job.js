@@ -3,7 +3,7 @@
 import { getJson, isAbort, upload } from "../lib/api.js";
 import { announce, announcer } from "../lib/announce.js";
 import { confirmed } from "../lib/dialog.js";
-import { namingControls } from "../lib/controls.js";
+import { inOurWords } from "../lib/controls.js";
 import { fill, h, hide } from "../lib/dom.js";
 import { bytes } from "../lib/format.js";
 import { METHODS } from "../lib/methods.js";
@@ -206,7 +206,7 @@ function wayToPrint(onChange) {
     refusal = reason;
     live.disabled = reason !== null;
     if (reason !== null) file.checked = true;
-    fill(hint, reason === null ? "" : `It cannot be printed live: ${namingControls(reason)}.`);
+    fill(hint, reason === null ? "" : inOurWords(`It cannot be printed live: ${reason}.`));
     hint.hidden = reason === null;
   };
   return { element, refuse, isLive: () => live.checked, isPossible: () => refusal === null };
