@@ -92,6 +92,31 @@ def test_large_letters_need_no_sideways_scrolling(visitor: Visitor, service: Ser
         assert wide <= inner == small["width"], view
 
 
+CUT_OFF = """() => [...document.querySelectorAll(".figure .big")].filter((line) => {
+    const text = document.createRange();
+    text.selectNodeContents(line);
+    const end = line.closest(".figure").getBoundingClientRect().right;
+    return text.getBoundingClientRect().right > end;
+}).map((line) => line.textContent)"""
+
+
+@pytest.mark.parametrize("kind", ["page", "report", "design"])
+def test_the_headline_is_whole_at_every_width(visitor: Visitor, gear: dict[str, Any], kind: str):
+    """A figure that lost its end would be another one."""
+    page = visitor.open(
+        {
+            "page": f"#/jobs/{gear['id']}",
+            "report": gear["links"]["report"].removeprefix("/"),
+            "design": "v1/machines/ender3/design.html?axis=x",
+        }[kind]
+    )
+    page.locator(".figure .big").first.wait_for()
+    for width in range(320, 1281, 40):
+        page.set_viewport_size({"width": width, "height": 800})
+        assert page.evaluate(CUT_OFF) == [], width
+        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), width
+
+
 def test_the_theme_follows_the_system_and_the_switch(visitor: Visitor, show: Callable[..., Page]):
     page = show(visitor, "new", color_scheme="dark")
     ground = "getComputedStyle(document.body).backgroundColor"

@@ -393,7 +393,9 @@ def test_the_list_has_pages_and_states(visitor: Visitor, service: Service, gear:
         service.api.delete(f"/v1/jobs/{job}")
 
 
-@pytest.mark.parametrize("options", [{}, {"where": "walls"}, {"method": "none"}])
+@pytest.mark.parametrize(
+    "options", [{}, {"where": "walls"}, {"method": "none"}, {"budget_um": "25"}]
+)
 def test_list_page_and_report_say_the_same(
     visitor: Visitor, service: Service, options: dict[str, str]
 ):
@@ -405,13 +407,14 @@ def test_list_page_and_report_say_the_same(
     shown = [page.locator(f".headline .{name}") for name in ("before", "after")]
     assert listed == [figure.inner_text() for figure in shown]
     label = page.locator(".headline .first .label").inner_text()
+    assert "–" not in page.locator(".headline").inner_text()  # no figure that is not known
     assert ("of outer walls" in label) is ("where" in options)
     features = page.get_by_role("region", name="Contour error by feature").inner_text()
     assert "Outer wall (WALL-OUTER)" in features
     page.goto(visitor.url + job["links"]["report"])
     expect(page.locator(".figure.main .label")).to_have_text(label, ignore_case=True)
     expect(page.locator(".figure.main .big")).to_have_text(f"{listed[0]} → {listed[1]} µm")
-    expect(page.get_by_role("rowheader", name="outer wall (WALL-OUTER)")).to_be_visible()
+    expect(page.get_by_role("rowheader", name="outer wall (WALL-OUTER)").first).to_be_visible()
     if options.get("method") == "none":
         # Nothing was compensated, and nothing says so.
         expect(page.get_by_role("columnheader", name="as written").first).to_be_visible()
@@ -454,8 +457,13 @@ def test_a_job_that_is_not_there(visitor: Visitor):
     page.get_by_role("link", name="All jobs").click()
     expect(page.locator("h1")).to_have_text("Jobs")
     page.goto(f"{visitor.url}/#/machines/nobody")
+    # Not the view before it, in the tab's title and to a screen reader.
+    expect(page).to_have_title("Unknown machine · Stillpath")
+    expect(page.get_by_role("heading", level=1)).to_be_focused()
     page.get_by_role("link", name="All machines").click()
     expect(page.locator("h1")).to_have_text("Machines")
+    page.goto(f"{visitor.url}/#/jobs/%E0%A4%A")
+    expect(page.locator("h1")).to_have_text("No such page")
 
 
 @pytest.fixture(scope="module")
