@@ -171,6 +171,20 @@ def test_a_wrong_value_that_is_folded_away_is_shown(visitor: Visitor, tmp_path: 
     expect(page.get_by_label("Speed budget, µm")).to_be_focused()
 
 
+def test_the_focus_stays_where_an_upload_was_cancelled(visitor: Visitor, tmp_path: Path):
+    file = tmp_path / "part.gcode"
+    file.write_bytes(PART)
+    page = visitor.open()
+    page.route(
+        "**/v1/jobs?*", lambda route: None if route.request.method == "POST" else route.continue_()
+    )
+    hand_in(page, file)
+    page.get_by_role("button", name="Cancel").focus()
+    page.keyboard.press("Enter")
+    expect(page.get_by_text("Not sent.")).to_be_visible()
+    expect(page.get_by_role("button", name="Compensate")).to_be_focused()
+
+
 @pytest.mark.parametrize(
     ("script", "said", "choice", "heading"),
     [
@@ -384,11 +398,21 @@ def test_the_list_has_pages_and_states(visitor: Visitor, service: Service, gear:
     with page.expect_response(first_page):
         slow[0].continue_()
     page.wait_for_timeout(300)
-    assert page.get_by_role("link", name="part00.gcode").is_visible()
+    # Who looks at a job of the second page comes back to it.
+    page.get_by_role("link", name="part00.gcode").click()
+    expect(page.locator("h1")).to_have_text("part00.gcode")
+    page.go_back()
+    expect(page.get_by_role("link", name="part00.gcode")).to_be_visible()
     page.get_by_role("button", name="Newer").click()
     expect(page.get_by_role("link", name="part27.gcode")).to_be_visible()
     page.get_by_role("button", name="Done", exact=True).click()
     expect(page.get_by_role("link", name="gear.gcode").first).to_be_visible()
+    page.get_by_role("link", name="gear.gcode").first.click()
+    expect(page.locator("h1")).to_have_text("gear.gcode")
+    page.go_back()
+    expect(page.get_by_role("button", name="Done", exact=True)).to_have_attribute(
+        "aria-pressed", "true"
+    )
     for job in made:
         service.api.delete(f"/v1/jobs/{job}")
 

@@ -1,6 +1,7 @@
 /** The machines that jobs can name: one's own first, then those that are built in. */
 
 import { getJson } from "../lib/api.js";
+import { announce } from "../lib/announce.js";
 import { helpLink } from "../lib/controls.js";
 import { fill, h } from "../lib/dom.js";
 import { measurementPanel } from "../machine/measurement.js";
@@ -17,7 +18,9 @@ export async function show({ main, signal, setTitle }) {
   const draw = () => {
     const words = search.value.toLowerCase().split(/\s+/).filter(Boolean);
     const fits = (/** @type {any} */ m) => words.every((/** @type {string} */ w) => `${m.title} ${m.name}`.toLowerCase().includes(w));
-    fill(list, group("Your own", own.filter(fits), own.length ? null : "None yet. Make one below."),
+    const found = machines.some(fits);
+    if (!found) announce("No machine has such a name.");
+    fill(list, !found ? h("p.empty", null, "No machine has such a name.") : null, group("Your own", own.filter(fits), own.length || words.length ? null : "None yet. Make one below."),
       group("Built in", builtin.filter(fits), null));
   };
   draw();

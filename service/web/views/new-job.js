@@ -112,6 +112,8 @@ export async function show({ main, signal, setTitle }) {
       const stopped = isWhole ? "All of it had been sent: see whether it is among the jobs." : "Not sent.";
       fill(status, isAbort(error) ? h("p.hint", null, stopped) : problemPanel(error));
       ready();
+      // What was pressed is gone, or was disabled meanwhile.
+      if (document.activeElement === document.body) send.focus({ preventScroll: true });
     } finally {
       removeEventListener("beforeunload", warn);
     }
