@@ -114,7 +114,8 @@ def test_the_headline_is_whole_at_every_width(visitor: Visitor, gear: dict[str, 
     for width in range(320, 1281, 40):
         page.set_viewport_size({"width": width, "height": 800})
         assert page.evaluate(CUT_OFF) == [], width
-        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), width
+        # Charts are drawn anew a moment later.
+        page.wait_for_function("document.documentElement.scrollWidth <= innerWidth", timeout=20_000)
 
 
 def test_the_theme_follows_the_system_and_the_switch(visitor: Visitor, show: Callable[..., Page]):

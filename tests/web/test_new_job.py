@@ -230,6 +230,21 @@ def test_a_file_dropped_beside_its_place_opens_nothing(visitor: Visitor):
     assert prevented == [True, True]
 
 
+def test_files_that_are_left_out_are_told(visitor: Visitor):
+    page = visitor.open()
+    page.locator(".drop").evaluate(
+        """(zone) => {
+          const dataTransfer = new DataTransfer();
+          const files = ["one.gcode", "two.gcode"].map((name) => new File(["G28"], name));
+          for (const file of files) dataTransfer.items.add(file);
+          const drop = { bubbles: true, cancelable: true, dataTransfer };
+          zone.dispatchEvent(new DragEvent("drop", drop));
+        }"""
+    )
+    expect(page.locator(".drop")).to_contain_text("one.gcode")
+    expect(page.locator(".drop")).to_contain_text("one file at a time: 1 left out")
+
+
 def test_a_file_sliced_again_is_to_be_chosen_again(visitor: Visitor, tmp_path: Path):
     """What the page says when nothing comes back; whole uploads of changed files hang Chromium."""
     file = tmp_path / "part.gcode"
@@ -518,6 +533,9 @@ def test_a_key_is_asked_for_and_goes_along(guarded: Service, visitor: Visitor, t
     hand_in(page, file)
     expect(page.locator(".headline")).to_contain_text("explain what is known of the machine")
     expect(page.locator(".stage:not([aria-busy])")).to_be_visible()
+    for width in (320, 641, 700, 1280):  # with the button that forgets it
+        page.set_viewport_size({"width": width, "height": 900})
+        assert page.locator(".top").evaluate("top => top.scrollWidth <= top.clientWidth"), width
     # The browser fetches it, straight to the disk: a phone has no room for it in memory.
     link = page.get_by_role("link", name=re.compile("^G-code"))
     with page.expect_download() as download:
