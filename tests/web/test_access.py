@@ -100,6 +100,17 @@ CUT_OFF = """() => [...document.querySelectorAll(".figure .big")].filter((line) 
 }).map((line) => line.textContent)"""
 
 
+@pytest.mark.parametrize("kind", ["report", "design"])
+def test_axe_finds_nothing_in_reports(visitor: Visitor, gear: dict[str, Any], kind: str):
+    report = gear["links"]["report"].removeprefix("/")
+    address = report if kind == "report" else "v1/machines/ender3/design.html?axis=x"
+    page = visitor.open(address, viewport=PHONE)
+    for details in page.locator("main details > summary").all():
+        details.click()
+    found = Axe().run(page).response["violations"]
+    assert [v["id"] for v in found if v["impact"] in ("serious", "critical")] == []
+
+
 @pytest.mark.parametrize("kind", ["page", "report", "design"])
 def test_the_headline_is_whole_at_every_width(visitor: Visitor, gear: dict[str, Any], kind: str):
     """A figure that lost its end would be another one."""
