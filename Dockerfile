@@ -20,6 +20,7 @@ COPY reports reports
 COPY applications applications
 COPY service service
 COPY cli cli
+COPY docs docs
 COPY integrations/slicers integrations/slicers
 RUN python -m pip wheel --no-deps --wheel-dir /dist . \
     && /opt/stillpath/bin/pip install --no-deps /dist/stillpath-*.whl

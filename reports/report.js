@@ -277,6 +277,25 @@
   }
   if (views.length) redraws.push(layerViews());
 
+  // The service that sends this page has the documents, too; beside a file there are none.
+  const service = /^https?:/.test(location.protocol)
+    ? /^(.*\/)v1\/jobs\/[^/]+\/report$/.exec(location.pathname) : null;
+  if (service) {
+    const named = /\bdocs\/([\w/-]+)\.md\b/;
+    for (const box of document.querySelectorAll("main p, main li, main td")) {
+      for (const text of [...box.childNodes]) {
+        if (text.nodeType !== Node.TEXT_NODE || !named.test(text.data)) continue;
+        text.replaceWith(...text.data.split(named).map((part, k) => {
+          if (k % 2 === 0) return part;
+          const link = document.createElement("a");
+          link.href = `${service[1]}help/${part}`;
+          link.textContent = `docs/${part}.md`;
+          return link;
+        }));
+      }
+    }
+  }
+
   const redraw = () => redraws.forEach((draw) => draw());
   redraw();
   let width = window.innerWidth;

@@ -136,6 +136,7 @@ def test_it_serves_without_the_sources_and_writes_only_data(image: Image):
         )
         assert where.stdout.startswith(str(installed))
 
+        assert "<h1" in client.get("/help/safety").text
         assert client.get("/v1/jobs", headers={"X-Api-Key": "sp_" + "x" * 32}).status_code == 401
         text = (ROOT / "examples" / "ps_ender3_pauses_hept24f.gcode").read_bytes()
         answer = client.post("/v1/jobs", params={"machine": "ender3"}, content=text)

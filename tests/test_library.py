@@ -67,15 +67,21 @@ def test_a_checkout_without_links_makes_the_same_wheel(tmp_path: Path) -> None:
             (package / path.name).write_text(f"../../{path.name}")
         elif path.is_file():
             shutil.copy(path, package)
-    for name in ("pyproject.toml", "README.md", "LICENSE", "integrations", *LAYERS):
+    for name in ("pyproject.toml", "README.md", "LICENSE", "docs", "integrations", *LAYERS):
         (checkout / name).symlink_to(ROOT / name)
     build = [sys.executable, "-m", "hatchling", "build", "--target", "wheel", "-d", str(tmp_path)]
     subprocess.run(build, cwd=checkout, check=True, capture_output=True)
     (wheel,) = tmp_path.glob("*.whl")
-    made = {name for name in zipfile.ZipFile(wheel).namelist() if name.endswith(".py")}
+    names = zipfile.ZipFile(wheel).namelist()
+    made = {name for name in names if name.endswith(".py")}
     package = ROOT / "src" / "stillpath"
     modules = [*package.glob("*.py"), *(p for k in LAYERS for p in (package / k).rglob("*.py"))]
     assert made == {p.relative_to(ROOT / "src").as_posix() for p in modules} | {"stillpath_post.py"}
+    texts = {p.relative_to(ROOT).as_posix() for p in (ROOT / "docs").rglob("*.md")}
+    assert {f"stillpath/{text}" for text in texts} == {
+        n for n in names if "/docs/" in n and n.endswith(".md")
+    }
+    assert "stillpath/docs/images/corner.svg" in names
 
 
 def test_python_runs_it_as_a_module() -> None:

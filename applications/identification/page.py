@@ -55,6 +55,13 @@ class _Axis:
     a: AxisFigures
     figures: Sequence[Figure]
 
+    @property
+    def lead(self) -> int:
+        """Index of the strongest mode within what was measured; outside, modes are a guess."""
+        low_hz, high_hz = self.a.band_hz or (0.0, math.inf)
+        inside = (k for k, mode in enumerate(self.a.modes) if low_hz <= mode.f_hz <= high_hz)
+        return next(inside, 0)
+
 
 def _figures(axis: AxisFigures) -> list[Figure]:
     if axis.spectra:

@@ -18,6 +18,7 @@ from stillpath.applications.machines.store import MachineStore
 from stillpath.service.api import (
     controllers,
     designs,
+    documentation,
     events,
     frequency,
     health,
@@ -147,6 +148,7 @@ def _prepare(state: State, settings: Settings, *, keys_required: bool) -> None:
 def _include_routes(app: FastAPI) -> None:
     app.include_router(health.router)
     app.include_router(pages.router)
+    app.include_router(documentation.router)
     for part in (
         jobs,
         events,

@@ -18,6 +18,7 @@ from stillpath.service.api.computing import (
     read_result,
     run_and_wait,
 )
+from stillpath.service.api.documentation import linked
 from stillpath.service.api.problems import Problem, responses
 from stillpath.service.jobs.state import JobKind
 
@@ -85,7 +86,7 @@ async def design_controller(
     vary = {"Vary": "Accept"}
     wanted = format or ("html" if prefers_page(accept) else "json")
     if wanted == "html":
-        return HTMLResponse(made["page"], headers=vary)
+        return HTMLResponse(linked(made["page"]), headers=vary)
     if wanted == "c":
         return PlainTextResponse(made["c"], headers=vary)
     return Response(made["report"], media_type="application/json", headers=vary)

@@ -19,6 +19,7 @@ from stillpath.service.api.computing import (
     read_result,
     run_and_wait,
 )
+from stillpath.service.api.documentation import linked
 from stillpath.service.api.machines import Name, look_up
 from stillpath.service.api.problems import responses
 from stillpath.service.jobs.state import JobKind
@@ -89,4 +90,4 @@ async def read_design_page(found: FoundDesign) -> HTMLResponse:
 def _page(found: DesignReport, headers: dict[str, str] | None = None) -> HTMLResponse:
     from stillpath.applications.design.page import render_design
 
-    return HTMLResponse(render_design(found), headers=headers)
+    return HTMLResponse(linked(render_design(found)), headers=headers)

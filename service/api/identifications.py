@@ -21,6 +21,7 @@ from stillpath.models.identification.readers.settings import ReadSettings
 from stillpath.models.machine import Machine
 from stillpath.service.api.access import Reader, Uploader
 from stillpath.service.api.computing import WAITING, ComputeRequest, read_result, run_and_wait
+from stillpath.service.api.documentation import linked
 from stillpath.service.api.forms import is_form
 from stillpath.service.api.machine_views import RevisionView
 from stillpath.service.api.machines import Author, Message, Name, as_problems, look_up
@@ -200,7 +201,7 @@ def read_identification_page(request: Request, name: Name, _: Reader) -> HTMLRes
     """Return one self-contained HTML page: measured and model, modes, shapers."""
     from stillpath.applications.identification.page import render_identification
 
-    return HTMLResponse(render_identification(_kept(request, name)))
+    return HTMLResponse(linked(render_identification(_kept(request, name))))
 
 
 def _kept(request: Request, name: str) -> IdentificationReport:

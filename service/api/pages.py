@@ -15,16 +15,17 @@ from importlib import resources
 from importlib.resources.abc import Traversable
 
 from fastapi import APIRouter, Request
+from jinja2 import Environment, FunctionLoader, StrictUndefined
 from starlette.responses import Response
 
+from stillpath.reports.pages import asset
 from stillpath.service.api.file_responses import matches
 from stillpath.service.api.problems import Problem
 
-__all__ = ["PageFile", "WebPage", "page_files", "router"]
+__all__ = ["PageFile", "WebPage", "answer", "framed", "page_files", "router"]
 
 _PACKAGE = "stillpath.service.web"
 _INDEX = "index.html"
-_PLACEHOLDER = b"{{version}}"
 _TYPES = {
     "html": "text/html; charset=utf-8",
     "js": "text/javascript; charset=utf-8",
@@ -69,10 +70,9 @@ class PageFile:
 
 @dataclass(frozen=True)
 class WebPage:
-    """The page and the files it needs, by their paths."""
+    """The files that the page needs, by their paths."""
 
     version: str
-    index: PageFile
     files: dict[str, PageFile]
 
 
@@ -80,14 +80,13 @@ class WebPage:
 def page_files() -> WebPage:
     """Return the files of the page, read once by each process."""
     contents = dict(sorted(_walk(resources.files(_PACKAGE), "")))
-    index = contents.pop(_INDEX)
+    del contents[_INDEX]  # a template
     digest = hashlib.sha256()
     for path, content in contents.items():
         digest.update(f"{path}\0{len(content)}\0".encode() + content)
     version = digest.hexdigest()[:12]
     return WebPage(
         version=version,
-        index=PageFile(index.replace(_PLACEHOLDER, version.encode()), _TYPES["html"]),
         files={
             path: PageFile(content, _TYPES[_suffix(path)]) for path, content in contents.items()
         },
@@ -97,7 +96,7 @@ def page_files() -> WebPage:
 @router.api_route("/", methods=["GET", "HEAD"])
 def read_page(request: Request) -> Response:
     """Return the page."""
-    return _answer(request, page_files().index, _ASK_FIRST)
+    return answer(request, _index())
 
 
 @router.api_route("/assets/{version}/{path:path}", methods=["GET", "HEAD"])
@@ -111,10 +110,40 @@ def read_asset(request: Request, version: str, path: str) -> Response:
     file = page.files.get(path)
     if file is None:
         raise Problem(404, "Not Found", f"The page has no file {path[:100]!r}; reload it.")
-    return _answer(request, file, _FOR_GOOD if version == page.version else _ASK_FIRST)
+    return answer(request, file, _FOR_GOOD if version == page.version else _ASK_FIRST)
 
 
-def _answer(request: Request, file: PageFile, caching: str) -> Response:
+def framed(template: str, root: str, **values: object) -> PageFile:
+    """Return a page of a template that extends the page's frame.
+
+    Parameters
+    ----------
+    template : str
+        Its name in `service/web`.
+    root : str
+        The way from the page's address to that of the service: ``../``.
+    **values
+        Names of the template; a missing one is an error.
+    """
+    environment = Environment(
+        loader=FunctionLoader(lambda name: asset(_PACKAGE, name)),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    page = environment.get_template(template)
+    assets = f"{root}assets/{page_files().version}"
+    return PageFile(page.render(root=root, assets=assets, **values).encode(), _TYPES["html"])
+
+
+@lru_cache(maxsize=1)
+def _index() -> PageFile:
+    return framed(_INDEX, "")
+
+
+def answer(request: Request, file: PageFile, caching: str = _ASK_FIRST) -> Response:
+    """Return a file with the headers of the page: packed, or 304, if the caller wants that."""
     headers = {**_SAFETY, "ETag": file.etag, "Cache-Control": caching, "Vary": "Accept-Encoding"}
     if matches(request.headers.get("if-none-match"), file.etag):
         return Response(status_code=304, headers=headers)

@@ -62,6 +62,17 @@ def pages(found: dict[str, Identified]) -> dict[str, str]:
     return {kind: render_identification(one.report) for kind, one in found.items()}
 
 
+def test_the_strongest_mode_is_one_that_was_measured(found: dict[str, Identified]):
+    report = found["spectrum"].report
+    (axis,) = report.axes
+    guess = axis.modes[0].model_copy(update={"f_hz": 309.4})
+    axis = axis.model_copy(update={"modes": (guess, *axis.modes), "peaks": (99.0, *axis.peaks)})
+    page = render_identification(report.model_copy(update={"axes": [axis]}))
+    headline = page.partition("strongest mode</p>")[2].partition("</div>")[0]
+    assert f"{axis.modes[1].f_hz:.1f} <small>Hz</small>" in headline
+    assert f"swings {axis.peaks[1]:.1f} times" in headline
+
+
 class Opened(HTMLParser):
     """Which elements are open at the end: none, if the page is well formed."""
 

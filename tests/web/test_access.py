@@ -15,7 +15,7 @@ from tests.web.served import PART, Service
 from tests.web.visitor import Visitor
 
 PHONE = {"width": 390, "height": 844}
-VIEWS = ["new", "jobs", "job", "machines", "machine", "own"]
+VIEWS = ["new", "jobs", "job", "machines", "machine", "own", "help"]
 
 
 @pytest.fixture(scope="module")
@@ -29,6 +29,7 @@ def show(service: Service, gear: dict[str, Any]) -> Callable[..., Page]:
         "machines": ("#/machines", ".cards"),
         "machine": ("#/machines/annex-k3", ".plot canvas"),
         "own": ("#/machines/shown", ".row-actions"),
+        "help": ("help/running", ".help table"),
     }
 
     def opened(visitor: Visitor, view: str, **options: Any) -> Page:
@@ -83,11 +84,49 @@ def test_large_letters_need_no_sideways_scrolling(visitor: Visitor, service: Ser
         ("#/jobs", ".job-row"),
         ("#/machines", ".cards"),
         (f"#/jobs/{job['id']}", "text=Filter for Klipper"),
+        ("help/dialects", ".help table"),
     ):
         page.goto(f"{visitor.url}/{view}")
         page.locator(there).first.wait_for()
         wide, inner = page.evaluate("[document.documentElement.scrollWidth, innerWidth]")
         assert wide <= inner == small["width"], view
+
+
+CUT_OFF = """() => [...document.querySelectorAll(".figure .big")].filter((line) => {
+    const text = document.createRange();
+    text.selectNodeContents(line);
+    const end = line.closest(".figure").getBoundingClientRect().right;
+    return text.getBoundingClientRect().right > end;
+}).map((line) => line.textContent)"""
+
+
+@pytest.mark.parametrize("kind", ["report", "design"])
+def test_axe_finds_nothing_in_reports(visitor: Visitor, gear: dict[str, Any], kind: str):
+    report = gear["links"]["report"].removeprefix("/")
+    address = report if kind == "report" else "v1/machines/ender3/design.html?axis=x"
+    page = visitor.open(address, viewport=PHONE)
+    for details in page.locator("main details > summary").all():
+        details.click()
+    found = Axe().run(page).response["violations"]
+    assert [v["id"] for v in found if v["impact"] in ("serious", "critical")] == []
+
+
+@pytest.mark.parametrize("kind", ["page", "report", "design"])
+def test_the_headline_is_whole_at_every_width(visitor: Visitor, gear: dict[str, Any], kind: str):
+    """A figure that lost its end would be another one."""
+    page = visitor.open(
+        {
+            "page": f"#/jobs/{gear['id']}",
+            "report": gear["links"]["report"].removeprefix("/"),
+            "design": "v1/machines/ender3/design.html?axis=x",
+        }[kind]
+    )
+    page.locator(".figure .big").first.wait_for()
+    for width in range(320, 1281, 40):
+        page.set_viewport_size({"width": width, "height": 800})
+        assert page.evaluate(CUT_OFF) == [], width
+        # Charts are drawn anew a moment later.
+        page.wait_for_function("document.documentElement.scrollWidth <= innerWidth", timeout=20_000)
 
 
 def test_the_theme_follows_the_system_and_the_switch(visitor: Visitor, show: Callable[..., Page]):
@@ -161,9 +200,13 @@ def test_the_page_works_below_a_path_of_a_proxy(
     page.route("**/*", pass_on)
     page.goto(f"{below}/#/jobs/{gear['id']}")
     page.locator(".stage[data-renderer]:not([aria-busy])").wait_for()
-    links = page.locator("a[download], a[target=_blank]")
+    links = page.locator("a[download], .downloads a[target=_blank]")
     for link in links.evaluate_all("links => links.map(a => a.href)"):
         assert link.startswith(f"{below}/v1/jobs/{gear['id']}/"), link
+    for link in page.get_by_role("link", name="docs/").evaluate_all(
+        "links => links.map(a => a.href)"
+    ):
+        assert link.startswith(f"{below}/help/"), link
     with page.expect_download() as download:
         page.get_by_role("link", name="G-code").click()
     assert download.value.url == f"{below}/v1/jobs/{gear['id']}/result"

@@ -171,6 +171,20 @@ def test_a_wrong_value_that_is_folded_away_is_shown(visitor: Visitor, tmp_path: 
     expect(page.get_by_label("Speed budget, µm")).to_be_focused()
 
 
+def test_the_focus_stays_where_an_upload_was_cancelled(visitor: Visitor, tmp_path: Path):
+    file = tmp_path / "part.gcode"
+    file.write_bytes(PART)
+    page = visitor.open()
+    page.route(
+        "**/v1/jobs?*", lambda route: None if route.request.method == "POST" else route.continue_()
+    )
+    hand_in(page, file)
+    page.get_by_role("button", name="Cancel").focus()
+    page.keyboard.press("Enter")
+    expect(page.get_by_text("Not sent.")).to_be_visible()
+    expect(page.get_by_role("button", name="Compensate")).to_be_focused()
+
+
 @pytest.mark.parametrize(
     ("script", "said", "choice", "heading"),
     [
@@ -214,6 +228,21 @@ def test_a_file_dropped_beside_its_place_opens_nothing(visitor: Visitor):
         })"""
     )
     assert prevented == [True, True]
+
+
+def test_files_that_are_left_out_are_told(visitor: Visitor):
+    page = visitor.open()
+    page.locator(".drop").evaluate(
+        """(zone) => {
+          const dataTransfer = new DataTransfer();
+          const files = ["one.gcode", "two.gcode"].map((name) => new File(["G28"], name));
+          for (const file of files) dataTransfer.items.add(file);
+          const drop = { bubbles: true, cancelable: true, dataTransfer };
+          zone.dispatchEvent(new DragEvent("drop", drop));
+        }"""
+    )
+    expect(page.locator(".drop")).to_contain_text("one.gcode")
+    expect(page.locator(".drop")).to_contain_text("one file at a time: 1 left out")
 
 
 def test_a_file_sliced_again_is_to_be_chosen_again(visitor: Visitor, tmp_path: Path):
@@ -384,16 +413,28 @@ def test_the_list_has_pages_and_states(visitor: Visitor, service: Service, gear:
     with page.expect_response(first_page):
         slow[0].continue_()
     page.wait_for_timeout(300)
-    assert page.get_by_role("link", name="part00.gcode").is_visible()
+    # Who looks at a job of the second page comes back to it.
+    page.get_by_role("link", name="part00.gcode").click()
+    expect(page.locator("h1")).to_have_text("part00.gcode")
+    page.go_back()
+    expect(page.get_by_role("link", name="part00.gcode")).to_be_visible()
     page.get_by_role("button", name="Newer").click()
     expect(page.get_by_role("link", name="part27.gcode")).to_be_visible()
     page.get_by_role("button", name="Done", exact=True).click()
     expect(page.get_by_role("link", name="gear.gcode").first).to_be_visible()
+    page.get_by_role("link", name="gear.gcode").first.click()
+    expect(page.locator("h1")).to_have_text("gear.gcode")
+    page.go_back()
+    expect(page.get_by_role("button", name="Done", exact=True)).to_have_attribute(
+        "aria-pressed", "true"
+    )
     for job in made:
         service.api.delete(f"/v1/jobs/{job}")
 
 
-@pytest.mark.parametrize("options", [{}, {"where": "walls"}, {"method": "none"}])
+@pytest.mark.parametrize(
+    "options", [{}, {"where": "walls"}, {"method": "none"}, {"budget_um": "25"}]
+)
 def test_list_page_and_report_say_the_same(
     visitor: Visitor, service: Service, options: dict[str, str]
 ):
@@ -405,13 +446,14 @@ def test_list_page_and_report_say_the_same(
     shown = [page.locator(f".headline .{name}") for name in ("before", "after")]
     assert listed == [figure.inner_text() for figure in shown]
     label = page.locator(".headline .first .label").inner_text()
+    assert "–" not in page.locator(".headline").inner_text()  # no figure that is not known
     assert ("of outer walls" in label) is ("where" in options)
     features = page.get_by_role("region", name="Contour error by feature").inner_text()
     assert "Outer wall (WALL-OUTER)" in features
     page.goto(visitor.url + job["links"]["report"])
     expect(page.locator(".figure.main .label")).to_have_text(label, ignore_case=True)
     expect(page.locator(".figure.main .big")).to_have_text(f"{listed[0]} → {listed[1]} µm")
-    expect(page.get_by_role("rowheader", name="outer wall (WALL-OUTER)")).to_be_visible()
+    expect(page.get_by_role("rowheader", name="outer wall (WALL-OUTER)").first).to_be_visible()
     if options.get("method") == "none":
         # Nothing was compensated, and nothing says so.
         expect(page.get_by_role("columnheader", name="as written").first).to_be_visible()
@@ -454,8 +496,13 @@ def test_a_job_that_is_not_there(visitor: Visitor):
     page.get_by_role("link", name="All jobs").click()
     expect(page.locator("h1")).to_have_text("Jobs")
     page.goto(f"{visitor.url}/#/machines/nobody")
+    # Not the view before it, in the tab's title and to a screen reader.
+    expect(page).to_have_title("Unknown machine · Stillpath")
+    expect(page.get_by_role("heading", level=1)).to_be_focused()
     page.get_by_role("link", name="All machines").click()
     expect(page.locator("h1")).to_have_text("Machines")
+    page.goto(f"{visitor.url}/#/jobs/%E0%A4%A")
+    expect(page.locator("h1")).to_have_text("No such page")
 
 
 @pytest.fixture(scope="module")
@@ -486,6 +533,9 @@ def test_a_key_is_asked_for_and_goes_along(guarded: Service, visitor: Visitor, t
     hand_in(page, file)
     expect(page.locator(".headline")).to_contain_text("explain what is known of the machine")
     expect(page.locator(".stage:not([aria-busy])")).to_be_visible()
+    for width in (320, 641, 700, 1280):  # with the button that forgets it
+        page.set_viewport_size({"width": width, "height": 900})
+        assert page.locator(".top").evaluate("top => top.scrollWidth <= top.clientWidth"), width
     # The browser fetches it, straight to the disk: a phone has no room for it in memory.
     link = page.get_by_role("link", name=re.compile("^G-code"))
     with page.expect_download() as download:

@@ -12,7 +12,7 @@ import pytest
 from fastapi import FastAPI
 from starlette.testclient import TestClient
 
-from stillpath.service.api import pages, problems
+from stillpath.service.api import documentation, pages, problems
 from stillpath.service.api.pages import page_files
 
 WEB = Path(pages.__file__).resolve().parents[1] / "web"
@@ -25,6 +25,7 @@ def client() -> Iterator[TestClient]:
     app = FastAPI()
     problems.install(app)
     app.include_router(pages.router)
+    app.include_router(documentation.router)
     with TestClient(app, base_url="http://localhost") as opened:
         yield opened
 

@@ -22,7 +22,7 @@ export function headline(report, channels) {
   const chosen = report.settings?.where === "walls" ? "of outer walls" : "of visible surfaces";
   const label = `Contour error ${extrudes ? (selected.length ? chosen : "while extruding") : "of all motion (nothing is extruded)"}, rms`;
   const rubbing = extrudes ? Object.fromEntries(channels.map((c) => [c.name, c.contour_rubbing_um])) : {};
-  const ifGuidesRub = rubbing.after ? `. If guides rub, which was not measured: up to ${um(rubbing.after)} (${um(rubbing.before)} as sliced)` : "";
+  const ifGuidesRub = rubbing.after ? `. If guides rub, which was not measured: up to ${um(rubbing.after)}${rubbing.before ? ` (${um(rubbing.before)} as sliced)` : ""}` : "";
   const ratio = rms.before / rms.after;
   const change = 100 * (report.time_s / report.original_time_s - 1);
   return h("section.headline", { "aria-label": "Headline" },

@@ -2,7 +2,7 @@
 
 import { fill, h } from "../lib/dom.js";
 import { isAbort } from "../lib/api.js";
-import { namingControls } from "../lib/controls.js";
+import { inOurWords } from "../lib/controls.js";
 import { bytes, capital, counted, duration, grouped, um } from "../lib/format.js";
 import { retryPanel, unreachable } from "../lib/problem.js";
 import { folded, longTable, table } from "../parts/table.js";
@@ -24,7 +24,7 @@ export function reportSections(job, report, signal) {
     headline(report, channels),
     warnings(report),
     waysToPrint(job, report),
-    section("Error of the nozzle", report.notes.map((/** @type {string} */ note) => h("p", null, namingControls(note))),
+    section("Error of the nozzle", report.notes.map((/** @type {string} */ note) => h("p", null, inOurWords(note))),
       report.confirmation ? h("p", null, `The machine's model: ${report.confirmation}.`) : null, errorTable(channels, labels),
       h("p.hint", null, "Contour: distance to the planned path. Tracking: distance to where the nozzle was planned to be at that moment.")),
     layers(job, labels, signal),
@@ -48,7 +48,7 @@ function section(title, ...parts) {
 function warnings(report) {
   if (report.warnings.length === 0) return null;
   return h("section.notice", { "aria-label": "Please read" }, h("h2", null, "Please read"),
-    h("ul", null, report.warnings.map((/** @type {string} */ text) => h("li", null, namingControls(text)))));
+    h("ul", null, report.warnings.map((/** @type {string} */ text) => h("li", null, inOurWords(text)))));
 }
 
 /** @param {any[]} channels @param {Record<string, string>} labels */
@@ -143,7 +143,7 @@ function putBack(report, channels) {
     byChoice,
     byRule,
     longTable("Pieces reverted to the sliced lines", [{ title: "Lines", text: true }, { title: "Time" }, { title: "Extruding", wide: true }, { title: "Why", text: true }], pieces, (p) => [
-      `${p.line_first}–${p.line_last}`, duration(p.seconds), duration(p.extruding_seconds), p.reason], 20));
+      `${p.line_first}–${p.line_last}`, duration(p.seconds), duration(p.extruding_seconds), h("span", null, inOurWords(p.reason))], 20));
 }
 
 /** @param {any} report @returns {boolean} Whether no file was written, for it is to be printed live. */

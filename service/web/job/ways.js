@@ -1,6 +1,7 @@
 /** How a file can be printed: as it was written, or live inside Klipper. */
 
 import { computed, isAbort } from "../lib/api.js";
+import { inOurWords } from "../lib/controls.js";
 import { h } from "../lib/dom.js";
 import { save } from "../lib/files.js";
 import { bytes, duration, um } from "../lib/format.js";
@@ -15,7 +16,7 @@ const FILTER = "stillpath.json";
  */
 export function waysToPrint(job, report) {
   const ways = report.ways ?? [];
-  if (report.not_live) return h("section", null, h("p", null, `It cannot be printed live: ${report.not_live}.`));
+  if (report.not_live) return h("section", null, h("p", null, inOurWords(`It cannot be printed live: ${report.not_live}.`)));
   if (ways.length === 0) return null;
   const both = ways.length > 1;
   return h("section", null, h("h2", null, both ? "Two ways to print it" : "How to print it"),
@@ -59,7 +60,7 @@ function card(job, way) {
     ["Print time", duration(way.time_s)],
     ["File to print", bytes(way.file_bytes)],
   ];
-  const list = (/** @type {string[]} */ texts) => h("ul", null, texts.map((text) => h("li", null, text)));
+  const list = (/** @type {string[]} */ texts) => h("ul", null, texts.map((text) => h("li", null, inOurWords(text))));
   return h("div.card.way", null,
     h("h3", null, live ? "Print it live" : "Print it as a file"),
     h("p.hint", null, live ? "The file stays as sliced; an extra inside Klipper compensates the motion while it prints." : "The motion in the written file is compensated."),

@@ -1,5 +1,6 @@
 /** The key of the service: kept for as long as the tab is open, asked for when it is missing. */
 
+import { helpLink } from "./controls.js";
 import { h } from "./dom.js";
 
 const STORED = "stillpath.key";
@@ -73,7 +74,7 @@ function ask({ title, detail }) {
         h("p", { id: "key-reason" }, detail),
         h("label", { for: "key" }, "Key"),
         field,
-        h("p.hint", null, "It is kept in this tab only. Whoever runs the service makes keys with “stillpath keys”."),
+        h("p.hint", null, "It is kept in this tab only. Whoever runs the service makes ", helpLink("howto/keys", "keys"), " with “stillpath keys”."),
         h("div.actions", null,
           h("button.main", { type: "submit", value: "given" }, "Use this key"),
           h("button", { type: "button", onclick: () => dialog.close("") }, "Not now")),

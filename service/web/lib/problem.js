@@ -1,6 +1,6 @@
 /** What went wrong, as the service says it (RFC 9457) or as the browser does. */
 
-import { namingControls } from "./controls.js";
+import { inOurWords } from "./controls.js";
 import { h } from "./dom.js";
 
 /** An answer that is no success. */
@@ -59,7 +59,7 @@ export function problemPanel(error, ...actions) {
     "div.problem",
     { role: "alert" },
     h("p.title", null, document.title ?? "Something went wrong"),
-    h("p", null, namingControls(document.detail ?? "")),
+    h("p", null, inOurWords(document.detail ?? "")),
     document.text ? h("pre", { tabindex: "0", "aria-label": "The line of the file" },
       document.line ? `${document.line}: ${document.text}` : document.text) : null,
     actions.length ? h("div.actions", null, actions) : null,

@@ -33,7 +33,7 @@ export function startRouter(main, routes) {
     const here = new AbortController();
     leave = here;
     const path = location.hash.replace(/^#/, "") || "/";
-    const route = routes.find((r) => r.pattern.test(path));
+    const route = isReadable(path) ? routes.find((r) => r.pattern.test(path)) : undefined;
     mark(route?.name ?? "");
     fill(main, h("p.hint.late", null, "Loading …"));
     window.scrollTo(0, 0);
@@ -60,7 +60,9 @@ export function startRouter(main, routes) {
       if (isAbort(error) || here.signal.aborted) return;
       main.querySelector(":scope > .late")?.remove();
       const all = route !== undefined && path.startsWith(`/${route.name}/`) ? [h("a.button", { href: `#/${route.name}` }, `All ${route.name}`)] : [];
-      main.append(retryPanel(error, show, ...all));
+      const panel = retryPanel(error, show, ...all);
+      if (main.querySelector("h1") === null) setTitle(asHeading(panel));
+      main.append(panel);
     }
     if (!first && !here.signal.aborted) focusHeading(main);
     first = false;
@@ -70,6 +72,28 @@ export function startRouter(main, routes) {
     if (location.hash === "" || location.hash.startsWith("#/")) show();
   });
   show();
+}
+
+/** @param {string} path @returns {boolean} Whether it can be decoded; somebody may have typed it. */
+function isReadable(path) {
+  try {
+    return decodeURIComponent(path) !== "";
+  } catch {
+    return false;
+  }
+}
+
+/**
+ * Make the title of a problem that is all there is to see the heading.
+ *
+ * @param {HTMLElement} panel
+ * @returns {string} Its text.
+ */
+function asHeading(panel) {
+  const title = panel.querySelector(".title");
+  const text = title?.textContent ?? "";
+  title?.replaceWith(h("h1.title", null, text));
+  return text;
 }
 
 /**

@@ -1,5 +1,6 @@
 /** Plants over frequency: modulus and phase of the model, of its set, and what was measured. */
 
+import { inOurWords } from "../lib/controls.js";
 import { h } from "../lib/dom.js";
 import { interval, number } from "../lib/format.js";
 import { lineChart } from "../charts/line-chart.js";
@@ -54,7 +55,7 @@ export function identifiedPlots(report, signal) {
 export function fitPlots(axis, signal) {
   const letter = axis.axis.toUpperCase();
   return h("div", null, h("h4", null, `${letter} axis: ${axis.kind}`),
-    axis.warnings.length ? h("ul.notice", null, axis.warnings.map((/** @type {string} */ w) => h("li", null, w))) : null,
+    axis.warnings.length ? h("ul.notice", null, axis.warnings.map((/** @type {string} */ w) => h("li", null, inOurWords(w)))) : null,
     axis.spectra.map((/** @type {any} */ s) => lineChart({
       title: `Measured and fitted spectrum, ${letter}: ${s.label}`, signal, at: s.f_hz, x: HZ, y: { label: "(mm/s²)²/Hz" },
       series: [{ label: "Measured", values: s.measured, colour: "--soft", width: 1.2 }, { label: "Model", values: s.predicted, colour: "--after", width: 2.2 }],
@@ -68,7 +69,7 @@ export function fitPlots(axis, signal) {
     })]),
     modeTable(axis),
     axis.residual === null ? null : h("p.hint", null, axis.responses.length ? `Residual of the fit: ${number(100 * axis.residual)} %` : `Residual of the fit: ${number(axis.residual)} dB rms`),
-    axis.notes.map((/** @type {string} */ note) => h("p.hint", null, note)));
+    axis.notes.map((/** @type {string} */ note) => h("p.hint", null, inOurWords(note))));
 }
 
 /** @param {any} axis With `modes`. */

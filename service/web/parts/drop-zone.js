@@ -17,12 +17,14 @@ export function dropZone({ label, hint, multiple = false, onChoose }) {
   const zone = h("label.drop", { for: id }, input,
     h("span.arrow", { "aria-hidden": "true" }), name, more);
   const take = (/** @type {FileList | null | undefined} */ list) => {
-    const files = [...(list ?? [])].slice(0, multiple ? undefined : 1);
+    const given = [...(list ?? [])];
+    const files = multiple ? given : given.slice(0, 1);
     if (files.length === 0) return;
+    const change = given.length > files.length ? `one file at a time: ${given.length - 1} left out` : "choose another";
     zone.classList.add("chosen");
     fill(name, files.length === 1 ? files[0].name : `${files.length} files`);
     const total = files.reduce((sum, file) => sum + file.size, 0);
-    fill(more, `${bytes(total)}${files.length > 1 ? `: ${files.map((f) => f.name).join(", ")}` : " · choose another"}`);
+    fill(more, `${bytes(total)}${files.length > 1 ? `: ${files.map((f) => f.name).join(", ")}` : ` · ${change}`}`);
     onChoose(files);
   };
   // The same file chosen again, as after slicing anew, is a change too.

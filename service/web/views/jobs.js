@@ -17,9 +17,11 @@ const REFRESH_MS = 2000;
 /** @param {import("../lib/router.js").Place} place */
 export async function show({ main, signal, setTitle }) {
   setTitle("Jobs");
-  let state = "";
+  /** Of the page that somebody comes back to. */
+  const kept = history.state?.jobs;
+  let state = kept?.state ?? "";
   /** Cursors of the pages before this one, and of this one. @type {(string | null)[]} */
-  let cursors = [null];
+  let cursors = kept?.cursors ?? [null];
   /** @type {any} */
   let page = { jobs: [], next: null };
   let lacksKey = false;
@@ -53,6 +55,7 @@ export async function show({ main, signal, setTitle }) {
   async function reload(tells = false, ask = true) {
     const cursor = cursors.at(-1);
     const wanted = state;
+    if (tells) history.replaceState({ jobs: { state, cursors } }, "");
     // Another page or state may have been chosen before the answer comes.
     const isPast = () => cursor !== cursors.at(-1) || wanted !== state;
     try {

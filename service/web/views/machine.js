@@ -1,6 +1,7 @@
 /** One machine: its plants over frequency, its history, and new measurements. */
 
 import { getJson, isAbort } from "../lib/api.js";
+import { helpLink, inOurWords } from "../lib/controls.js";
 import { fill, h } from "../lib/dom.js";
 import { capital, number } from "../lib/format.js";
 import { problemPanel } from "../lib/problem.js";
@@ -33,8 +34,8 @@ export async function show({ main, signal, setTitle, params: [name] }) {
       measurementPanel({ machines, base: machine.name, own: isOwn, signal })),
     isOwn && machine.firmware.kind in SETTINGS ? h("section", null, h("h2", null, "New settings"), settingsPanel({ machine: summary, firmware: machine.firmware.kind, signal })) : null,
     h("section", null, h("h2", null, "Live printing"), summary.live_refusal
-      ? h("p", null, `It cannot print live: ${summary.live_refusal}.`)
-      : [h("p", null, "The extra inside Klipper compensates with this filter while the printer prints files as sliced."), filterButton(machine.name)]),
+      ? h("p", null, inOurWords(`It cannot print live: ${summary.live_refusal}.`))
+      : [h("p", null, "The extra inside Klipper compensates with this filter while the printer prints files as sliced: ", helpLink("klipper-live", "how to install it"), "."), filterButton(machine.name)]),
     h("section", null, isOwn ? h("h2", null, "Document") : null, folded("Travel and limits", () => facts(machine)),
       documentPanel({ where, name: machine.name, revision: isOwn ? summary.revision ?? null : null, signal })));
 

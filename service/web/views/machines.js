@@ -1,6 +1,8 @@
 /** The machines that jobs can name: one's own first, then those that are built in. */
 
 import { getJson } from "../lib/api.js";
+import { announce } from "../lib/announce.js";
+import { helpLink } from "../lib/controls.js";
 import { fill, h } from "../lib/dom.js";
 import { measurementPanel } from "../machine/measurement.js";
 import { settingsPanel } from "../machine/settings.js";
@@ -16,7 +18,9 @@ export async function show({ main, signal, setTitle }) {
   const draw = () => {
     const words = search.value.toLowerCase().split(/\s+/).filter(Boolean);
     const fits = (/** @type {any} */ m) => words.every((/** @type {string} */ w) => `${m.title} ${m.name}`.toLowerCase().includes(w));
-    fill(list, group("Your own", own.filter(fits), own.length ? null : "None yet. Make one below."),
+    const found = machines.some(fits);
+    if (!found) announce("No machine has such a name.");
+    fill(list, !found ? h("p.empty", null, "No machine has such a name.") : null, group("Your own", own.filter(fits), own.length || words.length ? null : "None yet. Make one below."),
       group("Built in", builtin.filter(fits), null));
   };
   draw();
@@ -25,7 +29,7 @@ export async function show({ main, signal, setTitle }) {
     h("p.lead", null, "A compensator is only as good as its model of the machine. Each built-in machine is one printer that somebody measured, and yours is different."),
     list,
     h("section", null, h("h2", null, "Make your own from the printer's settings"),
-      h("p.hint", null, "Limits and travel come from the firmware. How the frame rings is measured afterwards, on the machine's page."),
+      h("p.hint", null, "Limits and travel come from the firmware. How the frame rings is measured afterwards, on the machine's page: ", helpLink("identification", "how"), "."),
       settingsPanel({ machine: null, machines, signal })),
     h("section", null, h("h2", null, "Or from measurements, with another machine's limits"),
       measurementPanel({ machines, base: null, signal })));

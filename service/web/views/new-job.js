@@ -3,7 +3,7 @@
 import { getJson, isAbort, upload } from "../lib/api.js";
 import { announce, announcer } from "../lib/announce.js";
 import { confirmed } from "../lib/dialog.js";
-import { namingControls } from "../lib/controls.js";
+import { inOurWords } from "../lib/controls.js";
 import { fill, h, hide } from "../lib/dom.js";
 import { bytes } from "../lib/format.js";
 import { METHODS } from "../lib/methods.js";
@@ -112,6 +112,8 @@ export async function show({ main, signal, setTitle }) {
       const stopped = isWhole ? "All of it had been sent: see whether it is among the jobs." : "Not sent.";
       fill(status, isAbort(error) ? h("p.hint", null, stopped) : problemPanel(error));
       ready();
+      // What was pressed is gone, or was disabled meanwhile.
+      if (document.activeElement === document.body) send.focus({ preventScroll: true });
     } finally {
       removeEventListener("beforeunload", warn);
     }
@@ -206,7 +208,7 @@ function wayToPrint(onChange) {
     refusal = reason;
     live.disabled = reason !== null;
     if (reason !== null) file.checked = true;
-    fill(hint, reason === null ? "" : `It cannot be printed live: ${namingControls(reason)}.`);
+    fill(hint, reason === null ? "" : inOurWords(`It cannot be printed live: ${reason}.`));
     hint.hidden = reason === null;
   };
   return { element, refuse, isLive: () => live.checked, isPossible: () => refusal === null };

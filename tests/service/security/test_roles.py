@@ -81,6 +81,8 @@ HIDDEN = {
     "HEAD /": OPEN,
     "GET /assets/{version}/{path:path}": OPEN,
     "HEAD /assets/{version}/{path:path}": OPEN,
+    "GET /help/{name:path}": OPEN,
+    "HEAD /help/{name:path}": OPEN,
     "GET /printers/{name}": OPEN,
     "GET /printers/{name}/": OPEN,
     "GET /openapi.json": OPEN,
