@@ -36,7 +36,7 @@ from stillpath.pipeline.advising.messages import (
 )
 from stillpath.pipeline.advising.reading import FirstReading
 from stillpath.pipeline.clock import StageClock
-from stillpath.pipeline.file_dialect import dialect_for, dialect_warnings
+from stillpath.pipeline.file_dialect import cut_off_warnings, dialect_for, dialect_warnings
 from stillpath.pipeline.file_motion import STANDING_S, TextMotion
 from stillpath.pipeline.file_rewriting import file_rewriting
 from stillpath.pipeline.files import default_cache_dir
@@ -382,7 +382,13 @@ class _AdvisedFile:
             peak_velocity_mm_s=0.0,
             peak_accel_mm_s2=max((f.accel_mm_s2 or 0.0 for f in figures.features), default=0.0),
             extruding_s=sum(group.seconds for group in features),
-            warnings=[*self._dialect_warnings, *asked.warnings, *warnings, *advised.warnings()],
+            warnings=[
+                *self._dialect_warnings,
+                *cut_off_warnings(facts, asked.reader),
+                *asked.warnings,
+                *warnings,
+                *advised.warnings(),
+            ],
             notes=[*self._withdrawn, *noted, *kept_beyond(figures.features), _UNDO],
             layers=_merged(original.layers(), advised.layers()),
             features=features,

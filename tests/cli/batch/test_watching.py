@@ -93,6 +93,25 @@ def test_a_file_is_done_when_it_has_stopped_growing(folder):
     assert (folder / "a.gcode").read_text().startswith("G28")
 
 
+def test_a_copy_that_came_to_a_halt_is_waited_for(folder):
+    """Its slicer's last comment is missing; half of the file was compensated after two seconds."""
+    head = ";FLAVOR:Marlin\n;Generated with Cura_SteamEngine 5.10.2\nG28\nG1 X1\n"
+    with watching(folder) as watch:
+        (folder / "a.gcode").write_text(head)
+        for _ in range(30):
+            assert watch.look()
+        assert not watch.told
+        (folder / "a.gcode").write_text(head + "G1 X2\nM104 S0\n;End of Gcode\n")
+        assert [o.state for o in watch.until_quiet()] == ["done"]
+        assert (folder.parent / "out/ender3/a.stillpath.gcode").read_text().endswith("Gcode\n")
+        (folder / "b.gcode").write_text(head)
+        assert watch.look()
+        assert watch.look(after_s=30.0)
+        assert len(watch.told) == 1
+        watch.look(after_s=31.0)
+        assert [o.state for o in watch.until_quiet()] == ["done"]
+
+
 def test_atomic_renames(folder):
     with watching(folder) as watch:
         for content in ("G28 ; first", "G28 ; second"):
