@@ -455,6 +455,14 @@ def test_on_the_command_line(tmp_path: Path, monkeypatch, capsys):
         assert "unsafe" not in capsys.readouterr().out
         accept = ["printers", "accept", "left", "--printers", str(file)]
         assert run(accept) == 0
+        # A file on the command line is meant, whatever server the environment names.
+        monkeypatch.setenv("STILLPATH_SERVER", "http://127.0.0.1:9")
+        assert run(accept) == 0
+        assert run(command) == 2
+        assert "unsafe: [gcode_macro" in capsys.readouterr().out
+        assert run([*command, "--server", "http://127.0.0.1:9"]) == 2
+        assert "either --printers FILE or --server URL" in capsys.readouterr().err
+        monkeypatch.delenv("STILLPATH_SERVER")
         assert run(["printers", "check", "nobody", "--printers", str(file)]) == 2
         assert "known: advised, left, octo" in capsys.readouterr().err
     assert run(command) == 2
