@@ -24,6 +24,7 @@ from stillpath.cli.batch.output import Outcome, OutputFolder
 from stillpath.cli.batch.watching import Watcher
 from stillpath.cli.batch.worker_pool import LocalBackend, worker_pool
 from stillpath.pipeline.options import Options
+from tests.checkout import PYTHONPATH
 from tests.cli.batch.pretending import PretendedWorker
 from tests.service.machines import make_machine, with_accel
 
@@ -302,7 +303,7 @@ def test_killed_again_and_again(tmp_path):
         f"sys.exit(run(['watch', {str(folder)!r}, '-m', 'ender3', '-o', {str(out)!r},"
         " '--settle-s', '0.2', '--every-s', '0.5', '--jobs', '2']))\n"
     )
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "PRETENDED_DELAY_S": "0.15"}
+    environment = os.environ | {"PYTHONPATH": PYTHONPATH, "PRETENDED_DELAY_S": "0.15"}
     rng = random.Random(7)
     names = [f"part{n:02}" for n in range(12)]
     told: Counter[str] = Counter()
