@@ -189,8 +189,7 @@ class Checker:
         try:
             asked = ask(printer)
         except (Unreached, Unanswered, TargetRefused, NotReady) as error:
-            if isinstance(error, Unanswered | NotReady):
-                _check_kind(printer)
+            _check_kind(printer, answers=not isinstance(error, Unreached))
             raise PrinterUnknown(f"{printer.name} cannot be asked: {error}") from error
         found = findings(machine, asked, method=method or printer.method or DEFAULT_METHOD)
         now = _Remembered(
@@ -251,13 +250,13 @@ class Checker:
             ) from None
 
 
-def _check_kind(printer: Printer) -> None:
+def _check_kind(printer: Printer, *, answers: bool = True) -> None:
     """Raise PrinterUnknown if what answers at a printer's address is of the other kind."""
-    there = kind_there(printer)
+    there = kind_there(printer) if answers else None
     if there not in (None, printer.kind):
         raise PrinterUnknown(
             f"{printer.name} has kind {printer.kind}, but at {printer.url} answers "
-            f"{'a Moonraker' if there == 'moonraker' else 'an OctoPrint'}: set kind = \"{there}\" "
+            f'{"a Moonraker" if there == "moonraker" else "an OctoPrint"}: set kind = "{there}" '
             f"in [printer.{printer.name}]"
         )
 

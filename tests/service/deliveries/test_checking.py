@@ -307,7 +307,7 @@ def test_a_printer_that_is_off_and_an_octoprint(tmp_path: Path):
 def test_a_printer_of_the_other_kind_is_named(tmp_path: Path):
     """It was said to be away, or to be an OctoPrint."""
     checker = Checker(DocumentFolder(tmp_path))
-    said = r'kind octoprint, but at http\S+ answers a Moonraker: set kind = "moonraker" in \[printer'
+    said = r'kind octoprint, but at http\S+ answers a Moonraker: set kind = "moonraker" in \[pr'
     with moonraker() as server, pytest.raises(PrinterUnknown, match=said):
         checker.check(printer_at(server, kind="octoprint"), MACHINE)
     said = r'kind moonraker, but at http\S+ answers an OctoPrint: set kind = "octoprint"'
