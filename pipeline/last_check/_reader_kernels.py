@@ -267,7 +267,7 @@ def ours(
     rests : bool
         Compare the states before and after it with those of the original.
     in_doubt : bool
-        Stop at lines that set nothing but F, too: one may be the line after the awaited one.
+        Stop at lines that do not move X or Y, too: one may be the line after the awaited one.
     before, after : float array
         States of the original.
     place_mm, filament_mm
@@ -296,7 +296,9 @@ def ours(
                     k += 1
                 is_wanted = text[at + k] == 10
         next_at, mask = _words(text, at, words, False)
-        if next_at < 0 or (in_doubt and not is_wanted and mask == 16):
+        if next_at < 0:
+            break
+        if in_doubt and not is_wanted and way_xy_mm(state, words, mask) == 0.0:
             break
         if is_wanted and rests:
             found = compare_before(before, after, state, place_mm, filament_mm)
