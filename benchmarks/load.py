@@ -120,7 +120,7 @@ def server(data: Path, workers: int) -> Iterator[Server]:
     command = [sys.executable, "-c", "from stillpath.cli.main import main; main()", "serve"]
     command += ["--port", "0", "--data-dir", str(data), "--workers", str(workers)]
     environment = os.environ | {
-        "PYTHONPATH": str(ROOT),
+        "PYTHONPATH": os.pathsep.join((str(ROOT / "src"), str(ROOT))),
         "STILLPATH_REQUESTS_PER_MINUTE": "1000000",
         "STILLPATH_MAX_JOBS_PER_OWNER": "1000000",
         "STILLPATH_MAX_UPLOAD_BYTES": str(64 << 30),

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stillpath.cli.arguments import KeyOption, ServerOption
+from stillpath.cli.arguments import CommandRefused, KeyOption, ServerOption
 from stillpath.models.errors import ModelError
 
 if TYPE_CHECKING:
@@ -33,10 +33,14 @@ app = typer.Typer(
 
 @app.command()
 def check(
-    name: Name, printers: FileOption = None, server: ServerOption = None, key: KeyOption = None
+    context: typer.Context,
+    name: Name,
+    printers: FileOption = None,
+    server: ServerOption = None,
+    key: KeyOption = None,
 ) -> None:
     """Compare a printer's configuration with its machine. Exit code 0: all well, 2: not."""
-    found = _found(name, printers, server, key, accept=False)
+    found = _found(name, printers, _server(context, server), key, accept=False)
     for finding in found.findings:
         typer.echo(f"{'unsafe: ' if finding.unsafe else ''}{finding.text}")
     if found.findings:
@@ -46,11 +50,35 @@ def check(
 
 @app.command()
 def accept(
-    name: Name, printers: FileOption = None, server: ServerOption = None, key: KeyOption = None
+    context: typer.Context,
+    name: Name,
+    printers: FileOption = None,
+    server: ServerOption = None,
+    key: KeyOption = None,
 ) -> None:
     """Take a printer's configuration as it is now: later changes count from here."""
-    found = _found(name, printers, server, key, accept=True)
+    found = _found(name, printers, _server(context, server), key, accept=True)
     typer.echo(f"{name}: configuration remembered, for {found.machine} {found.machine_revision}")
+
+
+def _server(context: typer.Context, server: str | None) -> str | None:
+    """Return the service to ask; None where the command line names a file of printers instead.
+
+    Raises
+    ------
+    CommandRefused
+        The command line names both.
+    """
+    said = [
+        name
+        for name in ("printers", "server")
+        if (source := context.get_parameter_source(name)) and source.name == "COMMANDLINE"
+    ]
+    if len(said) > 1:
+        raise CommandRefused(
+            "give either --printers FILE or --server URL: a service has its own file of printers"
+        )
+    return None if "printers" in said else server
 
 
 def _found(

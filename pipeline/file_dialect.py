@@ -7,18 +7,21 @@ import re
 from math import hypot
 from typing import BinaryIO
 
+from stillpath.gcode import _slots as at
 from stillpath.gcode.commands import awaiting_extruder_mode
 from stillpath.gcode.detection import EIGHT_BIT_PRUSA, detect
 from stillpath.gcode.dialect import Dialect
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.dialects import dialect_of
 from stillpath.gcode.interpreter import Interpreter
+from stillpath.gcode.slicers.facts import SlicerFacts
 from stillpath.models.errors import ModelError
 from stillpath.models.firmware import Klipper, Marlin, RepRapFirmware
 from stillpath.models.machine import Machine
 from stillpath.pipeline.options import DialectName
 
 __all__ = [
+    "cut_off_warnings",
     "dialect_for",
     "dialect_warnings",
     "extruder_mode_awaited",
@@ -212,6 +215,20 @@ def no_moves(dialect: Dialect) -> GcodeError:
         f"the file contains no moves that {title} reads; is it G-code for {title}, with LF line "
         "ends? Klipper has no G01, and most builds of Marlin no g1: write G1"
     )
+
+
+def cut_off_warnings(facts: SlicerFacts, reader: Interpreter) -> list[str]:
+    """Return a warning if a file that was read to its end lacks what its slicer ends files with."""
+    if not facts.missing_end:
+        return []
+    line = int(reader.state.i[at.I_LINE]) - 1
+    text = (
+        f"the file ends behind line {line} without {facts.missing_end!r}, which "
+        f"{facts.slicer or 'its slicer'} writes at the end of every file: it was cut off, so "
+        "layers may be missing, and the lines that switch the heaters off; compare its size, and "
+        "copy or export it again"
+    )
+    return [text]
 
 
 def skipped_warnings(reader: Interpreter) -> list[str]:

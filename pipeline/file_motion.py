@@ -23,6 +23,7 @@ from stillpath.models.machine import Machine
 from stillpath.models.shaping import OFF, Shaping
 from stillpath.pipeline.endless import LengthGuard
 from stillpath.pipeline.file_dialect import (
+    cut_off_warnings,
     dialect_for,
     dialect_warnings,
     no_moves,
@@ -308,7 +309,11 @@ class FileMotion:
             self.feature_names = motion.reader.feature_names
             yield from motion
         self.time_s, self.shapers = motion.time_s, motion.shapers
-        self.warnings = [*doubtful, *motion.warnings]
+        self.warnings = [
+            *doubtful,
+            *cut_off_warnings(self.facts, motion.reader),
+            *motion.warnings,
+        ]
         self.notes = motion.notes
 
 

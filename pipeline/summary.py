@@ -13,7 +13,7 @@ from stillpath.models.machine import Machine
 from stillpath.pipeline.caution import Mixture
 from stillpath.pipeline.caution_notes import prediction_note, stated_note
 from stillpath.pipeline.clock import StageClock
-from stillpath.pipeline.file_dialect import skipped_notes, skipped_warnings
+from stillpath.pipeline.file_dialect import cut_off_warnings, skipped_notes, skipped_warnings
 from stillpath.pipeline.measuring.measure import Measurement
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.pipeline.operating_point import Operation
@@ -115,6 +115,7 @@ class Summary:
         if typed is not None:
             yield typed
         yield from self.totals.warnings
+        yield from cut_off_warnings(facts, self.reader)
         yield from skipped_warnings(self.reader)
         yield from self.measurement.warnings()
         if self.writer is not None:

@@ -165,18 +165,18 @@ class Settings(MachineSettings, BaseSettings):
     def _together(self) -> Self:
         """Refuse workers elsewhere that could not reach what lies here."""
         if self.scheduler is not None:
-            missing = [
-                ENV_PREFIX + name.upper()
-                for name, url in (
-                    ("database_url", self.database_url),
-                    ("storage_url", self.storage_url),
+            here = [
+                f"{ENV_PREFIX}{name} is {url or 'not set'} ({instead})"
+                for name, url, instead in (
+                    ("DATABASE_URL", self.database_url, "postgresql://..."),
+                    ("STORAGE_URL", self.storage_url, "s3://bucket/prefix"),
                 )
                 if url is None or url.startswith(("sqlite", "file"))
             ]
-            if missing:
+            if here:
                 raise ValueError(
-                    f"workers of the scheduler {self.scheduler} cannot reach this computer's files;"
-                    f" set {' and '.join(missing)} (PostgreSQL, S3) as well"
+                    f"workers of the scheduler {self.scheduler} cannot reach this computer's "
+                    f"files, so set what lies elsewhere: {', '.join(here)}"
                 )
         return self
 

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.checkout import PYTHONPATH
+
 ROOT = Path(__file__).parents[1]
 GEAR = str(ROOT / "examples" / "cura_ender3_gear24.gcode")
 
@@ -44,7 +46,7 @@ GEAR = str(ROOT / "examples" / "cura_ender3_gear24.gcode")
 )
 def test_it_runs(command: list[str]) -> None:
     script, *arguments = command
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    environment = {**os.environ, "PYTHONPATH": PYTHONPATH}
     done = subprocess.run(
         [sys.executable, str(ROOT / "benchmarks" / script), *arguments],
         env=environment,

@@ -14,6 +14,7 @@ from urllib.parse import urlsplit
 import pytest
 import yaml
 
+from tests.checkout import PYTHONPATH
 from tests.loading import module_at
 
 ROOT = Path(__file__).parents[1]
@@ -111,7 +112,7 @@ def test_the_site_builds_and_is_whole_in_itself(tmp_path: Path):
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
     built = subprocess.run(
         command, cwd=ROOT, capture_output=True, text=True,
-        env=os.environ | {"PYTHONPATH": str(ROOT), "NO_MKDOCS_2_WARNING": "1"},
+        env=os.environ | {"PYTHONPATH": PYTHONPATH, "NO_MKDOCS_2_WARNING": "1"},
     )  # fmt: skip
     assert built.returncode == 0, built.stderr[-3000:]
     pages = sorted(tmp_path.rglob("*.html"))

@@ -17,6 +17,7 @@ import stillpath
 from stillpath.models.identification.synthetic import simulate_log, write_raw_data
 from stillpath.models.identification.types import Excitation
 from stillpath.models.plants import PairsSpec, PolePair
+from tests.checkout import PYTHONPATH
 from tests.web.served import running
 
 ROOT = Path(__file__).parents[1]
@@ -31,6 +32,20 @@ def test_what_is_public_is_there_and_told() -> None:
         assert name == "__version__" or f"`{name}" in PAGE
     with pytest.raises(AttributeError, match="no attribute 'compensator'"):
         stillpath.compensator  # noqa: B018
+
+
+def test_processes_of_tests_run_this_checkout(tmp_path: Path) -> None:
+    """They ran the one that is installed, whose code may be another."""
+    code = "import stillpath, tests; print(stillpath.__file__, tests.__path__[0])"
+    found = subprocess.run(
+        [sys.executable, "-c", code],
+        env=os.environ | {"PYTHONPATH": PYTHONPATH},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout.split()
+    assert found == [str(ROOT / "src" / "stillpath" / "__init__.py"), str(ROOT / "tests")]
 
 
 def test_a_motion_does_not_take_the_place_of_its_print(tmp_path: Path) -> None:

@@ -1,8 +1,8 @@
 """Read RepRapFirmware's config.g, and the files that it calls, as the firmware does.
 
-Source: src/GCodes/GCodes2.cpp (M92, M201, M203, M208, M350, M404, M566, M669), GCodes5.cpp (M204),
-src/Tools/Tool.cpp (M207), src/Movement/AxisShaper.cpp (M593), Move.cpp (M572) and DDARing.cpp
-(M595), 3.6-dev of 2024-10.
+Source: src/GCodes/GCodes2.cpp (M92, M201, M203, M208, M350, M404, M505, M566, M669),
+GCodes5.cpp (M204), src/Tools/Tool.cpp (M207), src/Movement/AxisShaper.cpp (M593), Move.cpp (M572)
+and DDARing.cpp (M595), src/Platform/Platform.cpp (SetSysDir), 3.6-dev of 2024-10.
 """
 
 from __future__ import annotations
@@ -46,6 +46,7 @@ _NAMING = re.compile(
 _LARGEST_BYTES = 4_000_000
 _DEEPEST = 5
 _OVERRIDE = "config-override.g"
+_SYSTEM = PurePosixPath("/sys")
 
 
 class Setting(NamedTuple):
@@ -149,6 +150,8 @@ class _Reader:
     called: list[Path] = field(default_factory=list)
     named: dict[str, str] = field(default_factory=dict)
     """Numbers of variables, like ``global.x_max``."""
+    system: PurePosixPath = _SYSTEM
+    """Folder of the card in which M98 and M501 look, as M505 sets it; config.g is in /sys."""
 
     def settings(self) -> Settings:
         if not self.lines and not self.unread:
@@ -188,8 +191,8 @@ class _Reader:
             else:
                 self._call(called, place, calls)
         elif command.name == "M501" and not conditional:
-            self._call(_OVERRIDE, place, calls, optional=True)
-        elif command.name in _READ or command.name == _TOOL:
+            self._call(_OVERRIDE, place, calls, optional=self.system == _SYSTEM)
+        elif command.name in _READ or command.name in (_TOOL, "M505"):
             if conditional and command.name != _TOOL:
                 raise ModelError(
                     f"{place}: {command.name} stands under a condition, which only the printer "
@@ -200,7 +203,10 @@ class _Reader:
                     f"{place}: {command.name} has {found[1]}, which only the printer can "
                     "evaluate: give a copy of the file with the number in its place"
                 )
-            self.lines.append(Setting(command.name, dict(command.words), place))
+            if command.name == "M505":
+                self.system /= command.words.get("P", "").removeprefix("0:")
+            else:
+                self.lines.append(Setting(command.name, dict(command.words), place))
 
     def _name(self, text: str, *, conditional: bool) -> None:
         """Note a variable that is given a number; any other value is not known."""
@@ -223,22 +229,28 @@ class _Reader:
         path = self._found(called)
         if path is None:
             if not optional:
-                self.unread.append(called or place)
+                self.unread.append(str(self.system / called) if self._is_moved else called or place)
             return
         if path in calls or len(calls) > _DEEPEST:
             raise ModelError(f"{place}: {called} is called while it is being read; remove the call")
         self.called.append(path)
         self.read(_text_of(path), path.name, [*calls, path])
 
+    @property
+    def _is_moved(self) -> bool:
+        return self.system != _SYSTEM
+
     def _found(self, called: str) -> Path | None:
         """Return a file by its place on the printer's card, or one of its name beside config.g."""
         if self.folder is None or not called:
             return None
-        parts = PurePosixPath(called.removeprefix("0:")).parts
-        places = [(self.folder, parts), (self.folder, parts[-1:])]
-        if parts[0] == "/":
-            # config.g is in /sys.
-            places[0] = (self.folder.parent, parts[1:])
+        path = self.system / called.removeprefix("0:")
+        if path.is_relative_to(_SYSTEM):
+            places = [(self.folder, path.relative_to(_SYSTEM).parts)]
+        else:
+            places = [(self.folder.parent, path.parts[1:])]
+        if not self._is_moved:
+            places.append((self.folder, path.parts[-1:]))
         return next((found for place in places if (found := _below(*place)) is not None), None)
 
 

@@ -23,6 +23,7 @@ __all__ = [
     "check_apart",
     "check_names",
     "is_stamped",
+    "is_unfinished",
     "items_of",
     "parse_map",
     "print_files",
@@ -200,6 +201,18 @@ def is_stamped(path: Path) -> bool:
     except (GcodeError, OSError):
         return False
     return False
+
+
+def is_unfinished(path: Path) -> bool:
+    """Return whether a file lacks its slicer's end; False for what cannot be read."""
+    from stillpath.gcode.containers.opening import open_text
+    from stillpath.gcode.errors import GcodeError
+
+    try:
+        with open_text(path) as container:
+            return container.facts().missing_end != ""
+    except (GcodeError, OSError):
+        return False
 
 
 def _names(text: str) -> tuple[str, ...]:

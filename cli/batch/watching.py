@@ -14,7 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from stillpath.cli.batch.items import Group, Item, is_stamped, print_files
+from stillpath.cli.batch.items import Group, Item, is_stamped, is_unfinished, print_files
 from stillpath.cli.batch.output import Outcome, OutputFolder
 from stillpath.cli.batch.worker_pool import WorkerPool
 from stillpath.pipeline.files import replacing
@@ -25,6 +25,8 @@ _AGAIN_S = (10.0, 30.0, 60.0, 300.0)
 """How long to wait before what was not the file's fault is tried once more."""
 _TRIES_OF_WORK = 2
 """How often work is begun that broke: on a computer that prints it may disturb the print."""
+_STALLED_S = 60.0
+"""How long a file without its end is waited for: the copy may have come to a halt."""
 _STEP_S = 0.5
 
 _Signature = tuple[int, int, int]
@@ -48,6 +50,8 @@ class _Seen:
 
     signature: _Signature
     since: float
+    is_unfinished: bool | None = None
+    """None until it has stopped growing."""
     works: dict[str, _Work] | None = None
     """By machine; None until the file has stopped growing."""
     reported: str = field(default="", repr=False)
@@ -63,7 +67,8 @@ class Watcher:
     output : OutputFolder
         May lie in the watched folder.
     settle_s : float
-        A file counts as complete when it has not changed for so long.
+        A file counts as complete when it has not changed for so long; without its slicer's last
+        comment, for a minute.
     tell : callable
         Is given every outcome that is new.
     """
@@ -105,7 +110,7 @@ class Watcher:
                 del self._seen[path]
         for path, signature in present.items():
             seen = self._seen.setdefault(path, _Seen(signature, now))
-            if seen.signature != signature or now - seen.since < self._settle_s:
+            if seen.signature != signature or self._may_grow(path, seen, now - seen.since):
                 busy = True
             else:
                 busy |= self._hand_over(path, seen, now)
@@ -122,6 +127,13 @@ class Watcher:
                 state = path.stat()
                 found[path] = (state.st_size, state.st_mtime_ns, state.st_ino)
         return found
+
+    def _may_grow(self, path: Path, seen: _Seen, quiet_s: float) -> bool:
+        if quiet_s < self._settle_s:
+            return True
+        if seen.is_unfinished is None:
+            seen.is_unfinished = is_unfinished(path)
+        return seen.is_unfinished and quiet_s < _STALLED_S
 
     def _hand_over(self, path: Path, seen: _Seen, now: float) -> bool:
         place = path.relative_to(self._folder).as_posix()

@@ -63,8 +63,7 @@ class FileShapers:
         said = " and ".join(f"{name} from line {line}" for name, (line, _) in self._names.items())
         return (
             f"the file tries one setting of the firmware's shaper after the other ({said}), which "
-            "compensated lines would not show; slice one setting for the whole print if it is no "
-            "test"
+            "it would not show any more; slice one setting for the whole print if it is no test"
         )
 
     def note(self, line: bytes, number: int) -> None:

@@ -32,7 +32,7 @@ _COMMENTS = re.compile(rb"(?:\xef\xbb\xbf)?(?:[ \t\r]*(?:;[^\n]*)?\n)*")
 _COMMAND = re.compile(rb"^[ \t\r\f\v]*(?:[^\s;]|; stillpath)[^\n]*\n?", re.MULTILINE)
 _LOOKED_THROUGH_BYTES = 1 << 16
 _STOPS = (MarkKind.COLOR_CHANGE, MarkKind.PAUSE)
-_BEGINS, _TELLS = (np.isin(np.arange(256), list(found)) for found in (b";M \t", b"TPRemCE-"))
+_BEGINS, _TELLS = (np.isin(np.arange(256), list(found)) for found in (b";M \t", b"TPRemfCE- "))
 """Possible first bytes of a line that states times, and those after its semicolon."""
 
 
@@ -56,7 +56,7 @@ class Retiming:
         self._places, self._stops = _Places(), _Places()
         self._told_s: dict[tuple[TimeKind, bool], float] = {}
         """The longest time of every kind, and whether it is of the silent mode."""
-        self._size = 0
+        self._size = self._added_lines = 0
         self._head_end: int | None = None
         self._tail_start = 0
         self._tail_lead = b""
@@ -84,6 +84,7 @@ class Retiming:
         if item is not None and not self._keeps:
             self._note(text, item, np.broadcast_to(delay_s, (len(item.moves) + 1,)))
         self._size += len(text)
+        self._added_lines += text.count(b"\n") - (item.text.count(b"\n") if item else 0)
 
     def end(self, lines: bytes) -> int:
         """Insert more lines of ours behind the last command, before the tail; return their size."""
@@ -106,10 +107,12 @@ class Retiming:
         int
             Bytes written.
         """
-        times = _Times(self._told_s, self._stops, self._layer_delay_s, delay_s)
+        tail = self._tail_lead + self._tail if self._tail else b""
+        lines = self._added_lines + (self._head + tail).count(b"\n")
+        times = _Times(self._told_s, self._stops, self._layer_delay_s, delay_s, lines)
         ours: list[tuple[int, int, bytes | float]] = [
             (self._size if self._head_end is None else self._head_end, 0, self._head),
-            (self._tail_start, 0, self._tail_lead + self._tail if self._tail else b""),
+            (self._tail_start, 0, tail),
         ]
         done = written = 0
         for offset, length, what in merge(
@@ -173,8 +176,9 @@ class _Times:
         stops: _Places,
         second_layer_delay_s: float | None,
         delay_s: float,
+        added_lines: int,
     ) -> None:
-        self._stops = stops
+        self._stops, self._added_lines = stops, added_lines
         self._delay_s = delay_s
         self._first_layer_delay_s = (
             delay_s if second_layer_delay_s is None else second_layer_delay_s
@@ -199,6 +203,8 @@ class _Times:
                 return field.seconds + late_s
             case TimeKind.REMAINING:
                 return field.seconds + self._delay_s - late_s
+            case TimeKind.LINES:
+                return field.seconds + self._added_lines
             case TimeKind.UNTIL_STOP:
                 stop = bisect_left(self._stops.offset, offset)
                 if stop == len(self._stops.offset):

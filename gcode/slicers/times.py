@@ -2,8 +2,9 @@
 
 Forms: M73 (Marlin 2.1 documentation; P R, and Q S for the silent mode, C D to the next stop:
 PrusaSlicer 2.9, `GCodeProcessor.cpp`), and comments as they stand in the output of PrusaSlicer,
-SuperSlicer, OrcaSlicer, BambuStudio, Cura (Griffin too), ideaMaker, KISSlicer, Kiri:Moto and
-Snapmaker Luban.
+SuperSlicer, OrcaSlicer, BambuStudio, Cura (Griffin too), ideaMaker, KISSlicer, Kiri:Moto,
+Simplify3D and Snapmaker Luban. Luban's number of lines, by which touch screens show the progress,
+is found and rewritten like them.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ class TimeKind(Enum):
     REMAINING = "from here to the end"
     UNTIL_STOP = "from here to the next pause or change of colour"
     PERCENT = "share that is done, in per cent"
+    LINES = "lines of the file"
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +38,7 @@ class TimeField:
     start, end : int
         Bytes of the line that hold the number or duration.
     seconds : float
-        What they say; of `PERCENT` the per cent.
+        What they say; of `PERCENT` the per cent, of `LINES` their number.
     unit_s : float
         Seconds in one of a plain number.
     silent : bool
@@ -54,13 +56,17 @@ class TimeField:
     def written(self, seconds: float) -> bytes:
         """Return another time (or per cent) in the same form: units and decimals stay."""
         seconds = max(seconds, 0.0)
+        if words := _IN_WORDS.fullmatch(self.text):
+            hours, minutes = divmod(math.floor(seconds / 60.0 + 0.5 + 1e-9), 60)
+            return b"%d%b%d%b" % (hours, words[1], minutes, words[2])
         if _SPELLED.fullmatch(self.text):
             return _spelled(seconds, self.text)
         return _rounded(seconds / self.unit_s, self.text)
 
 
 _SPELLED = re.compile(rb"(?:\d+d ?)?(?:\d+h ?)?(?:\d+m ?)?(?:\d+(?:\.\d+)?s)?(?<=[dhms])")
-_PARTS = re.compile(rb"(\d+(?:\.\d+)?)([dhms])")
+_IN_WORDS = re.compile(rb"\d+( hours? )\d+( minutes?)")
+_PARTS = re.compile(rb"(\d+(?:\.\d+)?) ?([dhms])")
 _UNITS_S = {b"d": 86_400.0, b"h": 3600.0, b"m": 60.0, b"s": 1.0}
 
 _VALUE = r"(?P<{}>\d+(?:\.\d+)?(?:[dhms] ?(?:\d+(?:\.\d+)?[hms] ?)*(?<=[dhms]))?)"
@@ -86,6 +92,8 @@ _COMMENTS: tuple[tuple[re.Pattern[bytes], float], ...] = tuple(
         (r"; ?Estimated-in-GUI Build Time: +{} minutes", 60.0, "total"),
         (r"; --- print time: (?P<total>\d+(?:\.\d+)?)s ---", 1.0),
         (r"; ?estimated_time\(s\): ?{}", 1.0, "total"),
+        (r";   Build [Tt]ime: (?P<total>\d+ hours? \d+ minutes?)", 1.0),
+        (r";file_total_lines: ?(?P<lines>\d+)", 1.0),
     )
 )
 _KINDS = {
@@ -94,6 +102,7 @@ _KINDS = {
     "first_layer": TimeKind.FIRST_LAYER,
     "elapsed": TimeKind.ELAPSED,
     "remaining": TimeKind.REMAINING,
+    "lines": TimeKind.LINES,
 }
 _PROGRESS = re.compile(rb"\s*M73(?![\d.])([^;*\n]*)(?:;.*)?\s*$")
 _WORD = re.compile(rb"([PRQSCD])\s*(\d+(?:\.\d+)?)")
@@ -105,7 +114,7 @@ _WORDS = {
     b"C": (TimeKind.UNTIL_STOP, 60.0, False),
     b"D": (TimeKind.UNTIL_STOP, 60.0, True),
 }
-_FIRST = frozenset(b"TPRemCE-")
+_FIRST = frozenset(b"TPRemfCEB-")
 _LONGEST = 200
 
 
@@ -115,7 +124,7 @@ def may_tell_time(line: bytes) -> bool:
         return True
     if not line.startswith(b";"):
         return line[:1] in b" \t"
-    first = line[1:3].lstrip(b" ")
+    first = line[1:5].lstrip(b" ")
     return bool(first) and first[0] in _FIRST
 
 

@@ -29,6 +29,7 @@ from stillpath.pipeline.advising.choosing import AsSliced, Choice, choose
 from stillpath.pipeline.advising.inserting import MARK, AdviceWriter, write_advised
 from stillpath.pipeline.advising.messages import (
     beyond_bounds,
+    is_a_test,
     kept_beyond,
     shaper_warnings,
     stored_settings,
@@ -36,7 +37,7 @@ from stillpath.pipeline.advising.messages import (
 )
 from stillpath.pipeline.advising.reading import FirstReading
 from stillpath.pipeline.clock import StageClock
-from stillpath.pipeline.file_dialect import dialect_for, dialect_warnings
+from stillpath.pipeline.file_dialect import cut_off_warnings, dialect_for, dialect_warnings
 from stillpath.pipeline.file_motion import STANDING_S, TextMotion
 from stillpath.pipeline.file_rewriting import file_rewriting
 from stillpath.pipeline.files import default_cache_dir
@@ -160,8 +161,11 @@ class _AdvisedFile:
         names = asked.reader.feature_names
         with self._clock.stage("choose"):
             choice, first_layer = self._chosen(names, was, reading)
+            if reading.test is not None:
+                choice.withdrawn()
         with self._clock.stage("verify"):
-            writer, now = self._within_bounds(choice, was, asked.time_s, first_layer)
+            rounds = _ROUNDS if reading.test is None else 1
+            writer, now = self._within_bounds(choice, was, asked.time_s, first_layer, rounds)
         earlier.rewind()
         take_layer = layers.add if layers else None
         advised = Measurement(
@@ -208,6 +212,8 @@ class _AdvisedFile:
         shaper_left: bool,
     ) -> list[str]:
         """Return warnings: stored settings, unknown shapers, features with too large errors."""
+        if reading.test is not None:
+            return [is_a_test(reading.test)]
         unshaped = "" if self._shapes(reading) else None
         given_back = self._before.label if figures.shapers else unshaped
         helpless = [feature_name(f, names) for f in sorted(choice.helpless)]
@@ -233,9 +239,10 @@ class _AdvisedFile:
         was: dict[int, ClassError],
         was_s: float,
         first_layer: FirstLayer,
+        rounds: int,
     ) -> tuple[AdviceWriter, dict[int, ClassError]]:
         """Write and measure until every feature is within its bound or at its slowest."""
-        for attempt in range(_ROUNDS):
+        for attempt in range(rounds):
             writer = self._write(choice, first_layer)
             set_errors = SetErrors(self._machine, DT_S, stride=STRIDE)
             shares = 0.6 + 0.03 * attempt, 0.8
@@ -247,11 +254,11 @@ class _AdvisedFile:
                 if f in errors and errors[f].rms_um > _TOLERANCE * self._bound_um(f, was)
             }
             # The last round is reserved for writing the file without advice.
-            if attempt + 2 < _ROUNDS and over and choice.mended(over):
+            if attempt + 2 < rounds and over and choice.mended(over):
                 continue
             worse = bool(over) or _rms_um(errors) > _TOLERANCE * _rms_um(was)
             slower = written.time_s > was_s + _ROUNDING_S + _SETTING_S * writer.shapers_set
-            unbudgeted = self._options.budget_um is None and attempt + 1 < _ROUNDS
+            unbudgeted = self._options.budget_um is None and attempt + 1 < rounds
             # No better than as sliced: withdraw the advice.
             if not (unbudgeted and (worse or slower) and choice.withdrawn()):
                 break
@@ -382,7 +389,13 @@ class _AdvisedFile:
             peak_velocity_mm_s=0.0,
             peak_accel_mm_s2=max((f.accel_mm_s2 or 0.0 for f in figures.features), default=0.0),
             extruding_s=sum(group.seconds for group in features),
-            warnings=[*self._dialect_warnings, *asked.warnings, *warnings, *advised.warnings()],
+            warnings=[
+                *self._dialect_warnings,
+                *cut_off_warnings(facts, asked.reader),
+                *asked.warnings,
+                *warnings,
+                *advised.warnings(),
+            ],
             notes=[*self._withdrawn, *noted, *kept_beyond(figures.features), _UNDO],
             layers=_merged(original.layers(), advised.layers()),
             features=features,

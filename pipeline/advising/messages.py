@@ -6,7 +6,14 @@ from collections.abc import Sequence
 
 from stillpath.pipeline.result import AdvisedFeature
 
-__all__ = ["beyond_bounds", "kept_beyond", "shaper_warnings", "stored_settings", "withdrawn"]
+__all__ = [
+    "beyond_bounds",
+    "is_a_test",
+    "kept_beyond",
+    "shaper_warnings",
+    "stored_settings",
+    "withdrawn",
+]
 
 
 def shaper_warnings(
@@ -69,6 +76,14 @@ def stored_settings(lines: Sequence[int], *, shaper: str | None) -> list[str]:
         "the printer's, or remove the line."
     )
     return [said]
+
+
+def is_a_test(why: str) -> str:
+    """Return the warning that a file gets no advice because it is a test of settings."""
+    return (
+        f"No advice is given, so that the file shows what it tests: {why}. If it is no test, slice "
+        "one setting for the whole print."
+    )
 
 
 def beyond_bounds(

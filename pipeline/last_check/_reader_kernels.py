@@ -248,6 +248,7 @@ def ours(
     words: Any,
     wanted: Any,
     rests: bool,
+    in_doubt: bool,
     before: Any,
     after: Any,
     place_mm: Any,
@@ -265,6 +266,8 @@ def ours(
         The awaited line of the original without blanks at its end; may be empty. Executed if plain.
     rests : bool
         Compare the states before and after it with those of the original.
+    in_doubt : bool
+        Stop at lines that do not move X or Y, too: one may be the line after the awaited one.
     before, after : float array
         States of the original.
     place_mm, filament_mm
@@ -294,6 +297,8 @@ def ours(
                 is_wanted = text[at + k] == 10
         next_at, mask = _words(text, at, words, False)
         if next_at < 0:
+            break
+        if in_doubt and not is_wanted and way_xy_mm(state, words, mask) == 0.0:
             break
         if is_wanted and rests:
             found = compare_before(before, after, state, place_mm, filament_mm)

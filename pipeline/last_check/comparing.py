@@ -229,6 +229,7 @@ class LastCheck:
             self._words,
             wanted.array,
             wanted.kind is Kind.RESTS,
+            wanted.code in self._earlier,
             wanted.before,
             self._before.state,
             self._place_mm,

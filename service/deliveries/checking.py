@@ -26,7 +26,7 @@ from stillpath.models.errors import ModelError
 from stillpath.models.firmware import Klipper
 from stillpath.models.machine import Machine
 from stillpath.service.deliveries.http_requests import Unanswered, Unreached
-from stillpath.service.deliveries.moonraker import NotReady, PrinterState, ask
+from stillpath.service.deliveries.moonraker import NotReady, PrinterState, ask, kind_there
 from stillpath.service.deliveries.printers import Printer
 from stillpath.service.deliveries.targets import TargetRefused
 
@@ -181,6 +181,7 @@ class Checker:
             If it cannot be asked; nothing is known of it then.
         """
         if printer.kind != "moonraker":
+            _check_kind(printer)
             raise PrinterUnknown(
                 f"{printer.name} is an OctoPrint, which cannot tell what Klipper's configuration "
                 "says; check by hand (`stillpath machines check NAME --printer-cfg FILE`)"
@@ -188,6 +189,7 @@ class Checker:
         try:
             asked = ask(printer)
         except (Unreached, Unanswered, TargetRefused, NotReady) as error:
+            _check_kind(printer, answers=not isinstance(error, Unreached))
             raise PrinterUnknown(f"{printer.name} cannot be asked: {error}") from error
         found = findings(machine, asked, method=method or printer.method or DEFAULT_METHOD)
         now = _Remembered(
@@ -246,6 +248,17 @@ class Checker:
                 f"{self._documents.place(path)} is damaged; delete it, and the printer's "
                 "configuration as it is then counts"
             ) from None
+
+
+def _check_kind(printer: Printer, *, answers: bool = True) -> None:
+    """Raise PrinterUnknown if what answers at a printer's address is of the other kind."""
+    there = kind_there(printer) if answers else None
+    if there not in (None, printer.kind):
+        raise PrinterUnknown(
+            f"{printer.name} has kind {printer.kind}, but at {printer.url} answers "
+            f'{"a Moonraker" if there == "moonraker" else "an OctoPrint"}: set kind = "{there}" '
+            f"in [printer.{printer.name}]"
+        )
 
 
 def findings(

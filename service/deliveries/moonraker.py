@@ -1,26 +1,33 @@
 """A printer's state from Moonraker: configuration, limits in force, commands.
 
 Moonraker's docs/external_api/printer.md (`GET /printer/info`, `GET /printer/objects/query`) and
+server.md (`GET /server/info`), OctoPrint's docs/api/version.rst (`GET /api/version`) and
 Klipper's docs/Status_Reference.md (`configfile`, `toolhead`, `gcode`, `extruder`, `print_stats`),
 2026-07.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from stillpath.applications.machines.klipper_config import Option, PrinterConfig
-from stillpath.service.deliveries.http_requests import Unanswered, get
+from stillpath.service.deliveries.http_requests import Reply, Unanswered, Unreached, get
 from stillpath.service.deliveries.printers import Printer
-from stillpath.service.deliveries.targets import read_url
+from stillpath.service.deliveries.targets import TargetRefused, read_url
 
-__all__ = ["NotReady", "PrinterState", "ask"]
+__all__ = ["NotReady", "PrinterState", "ask", "kind_there"]
 
 _LONGEST_BYTES = 8 << 20
 _TIMEOUT_S = 5.0
+_TELLTALES: tuple[tuple[Literal["moonraker", "octoprint"], str, str], ...] = (
+    ("moonraker", "/server/info", '"klippy_connected"'),
+    ("octoprint", "/api/version", '"OctoPrint'),
+)
+"""Kind, where it answers, and what is in its answer. Moonraker may answer as OctoPrint, too."""
 _OBJECTS = (
     "configfile=settings,config&toolhead=max_velocity,max_accel,square_corner_velocity,"
     "minimum_cruise_ratio&gcode=commands&extruder=pressure_advance&print_stats=state"
@@ -111,17 +118,31 @@ def ask(printer: Printer) -> PrinterState:
     )
 
 
-def _result(printer: Printer, path: str) -> dict[str, Any]:
+def kind_there(printer: Printer) -> Literal["moonraker", "octoprint"] | None:
+    """Return of which kind the software at a printer's address says it is; None: it does not."""
+    for kind, path, word in _TELLTALES:
+        with contextlib.suppress(Unreached, Unanswered, TargetRefused):
+            reply = _get(printer, path)
+            if reply.status == 200 and reply.text.startswith("{") and word in reply.text:
+                return kind
+    return None
+
+
+def _get(printer: Printer, path: str) -> Reply:
     headers = {}
     if printer.api_key is not None:
         headers["X-Api-Key"] = printer.api_key.get_secret_value()
-    reply = get(
+    return get(
         read_url(printer.url + path),
         headers=headers,
         longest_bytes=_LONGEST_BYTES,
         loopback=True,  # as for uploads
         timeout_s=_TIMEOUT_S,
     )
+
+
+def _result(printer: Printer, path: str) -> dict[str, Any]:
+    reply = _get(printer, path)
     try:
         told = json.loads(reply.text)
     except (ValueError, RecursionError):

@@ -54,5 +54,6 @@ def _in_folder(root: Path, data_dir: Path) -> LocalStorage:
         with replacing(known, mode=0o600) as file:
             file.write_text(f"{root}\n", "utf-8")
     except OSError as error:
-        raise StorageError(error.errno, error.strerror, error.filename) from error
+        why = f"{error.strerror} (STILLPATH_STORAGE_URL; make the folder, or name another)"
+        raise StorageError(error.errno, why, error.filename) from error
     return storage

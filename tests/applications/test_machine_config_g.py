@@ -161,6 +161,31 @@ def test_files_that_it_calls(make, stored, sys: Path) -> None:
     assert run(["machines", "history", "mine"]) == 0
 
 
+_MOVED = 'M505 P"printing"\nM98 P"limits.g"\nM501\n'
+
+
+def test_files_in_another_folder_of_the_system(make, stored, sys: Path) -> None:
+    """M505 was passed over: the file of that name beside config.g was read instead."""
+    (sys / "limits.g").write_text("M201 X7000 Y6500 Z300 E2000\n")
+    (sys / "Printing").mkdir()
+    (sys / "Printing" / "limits.g").write_text("M201 X4000 Y4000 Z300 E2000\n")
+    (sys / "Printing" / "config-override.g").write_text("M208 S1 Z-1.25\n")
+    code, said = make(CONFIG_G + _MOVED)
+    assert code == 0
+    assert "not read" not in said
+    machine = stored()
+    assert (machine.firmware.x.max_accel_mm_s2, machine.travel["z"].min_mm) == (4000.0, -1.25)
+
+
+def test_another_folder_of_the_system_that_is_not_there(make, stored, sys: Path) -> None:
+    (sys / "limits.g").write_text("M201 X7000 Y6500 Z300 E2000\n")
+    code, said = make(CONFIG_G + _MOVED)
+    assert code == 0
+    assert "/sys/printing/limits.g: not read, so what it sets is unknown" in said
+    assert "/sys/printing/config-override.g: not read" in said
+    assert stored().firmware.x.max_accel_mm_s2 == 6000.0
+
+
 def test_files_that_are_not_there(make, stored) -> None:
     call = 'M98 P"/macros/speeds.g"\n'
     code, said = make(call + "M669 K1\nM92 X80 Y80 Z400 E400\nM203 X9000 Y9000 Z600 E3000\n")
@@ -206,6 +231,7 @@ def test_numbers_that_have_names(make, stored) -> None:
         ),
         ("M208 X-4:300", "M208 X300:-4", "min_mm 300.0 must be below max_mm -4.0"),
         ("M204 P4000", 'M98 P"config.g"\nM204 P4000', "line 13: config.g is called while it is"),
+        ("M204 P4000", 'if {true}\n  M505 P"b"\nM204 P4000', "M505 stands under a condition"),
         ("M593", "M593 " + "X1 " * 100 + ";", "more than 255"),
     ],
 )

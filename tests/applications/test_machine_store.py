@@ -37,6 +37,7 @@ from stillpath.service.database.documents import DocumentTable
 from stillpath.service.database.engine import open_database
 from stillpath.service.settings import Settings
 from tests.applications.store_writers import write_many
+from tests.checkout import PYTHONPATH
 from tests.service.machines import make_confirmation, make_machine, with_accel
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -314,7 +315,7 @@ def test_a_killed_writer_leaves_a_readable_store(store: MachineStore, tmp_path: 
     for round_ in range(4):
         command = [sys.executable, "-c", code, str(root), str(round_)]
         writer = subprocess.Popen(
-            command, stdout=subprocess.PIPE, cwd=ROOT, env=os.environ | {"PYTHONPATH": str(ROOT)}
+            command, stdout=subprocess.PIPE, cwd=ROOT, env=os.environ | {"PYTHONPATH": PYTHONPATH}
         )
         assert writer.stdout is not None
         writer.stdout.readline()

@@ -17,6 +17,7 @@ import pytest
 from stillpath.cli.main import run
 from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine
+from tests.checkout import PYTHONPATH
 from tests.service.jobs.site import STILLPATH
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -111,7 +112,7 @@ def test_an_interrupted_command_leaves_nothing(tmp_path: Path):
     target = tmp_path / "out.gcode"
     command = [*STILLPATH, "compensate", str(source), "-o", str(target), "-m", "ender3"]
     process = subprocess.Popen(
-        command, cwd=tmp_path, stderr=subprocess.PIPE, env=os.environ | {"PYTHONPATH": str(ROOT)}
+        command, cwd=tmp_path, stderr=subprocess.PIPE, env=os.environ | {"PYTHONPATH": PYTHONPATH}
     )
     deadline = time.monotonic() + 300
     while not writes_into(tmp_path, process.pid) and time.monotonic() < deadline:

@@ -14,8 +14,9 @@ from pathlib import Path
 import psutil
 import pytest
 
+from tests.checkout import PYTHONPATH
 from tests.service.database.postgres import PostgresServer
-from tests.service.test_server import PRETEND, ROOT, finished, post, server, until
+from tests.service.test_server import PRETEND, finished, post, server, until
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(os.name != "posix", reason="kills processes")]
 
@@ -34,7 +35,7 @@ def test_a_service_waits_for_postgresql(tmp_path: Path, monkeypatch: pytest.Monk
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        env=os.environ | {"PYTHONPATH": PYTHONPATH},
     )
     try:
         assert starting.stderr is not None
@@ -65,7 +66,7 @@ def test_an_end_leaves_nothing_but_logs(tmp_path: Path, how: signal.Signals) -> 
             [*PRETEND, str(data)],
             stdout=subprocess.DEVNULL,
             stderr=file,
-            env=os.environ | {"PYTHONPATH": str(ROOT)},
+            env=os.environ | {"PYTHONPATH": PYTHONPATH},
         )
         until(lambda: "jobs are processed again" in said.read_text(), 60)
         family = psutil.Process(process.pid).children(recursive=True)

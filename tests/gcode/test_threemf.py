@@ -21,6 +21,7 @@ from hypothesis import strategies as st
 from stillpath.gcode.containers.opening import open_text, rewriting
 from stillpath.gcode.containers.sniff import Kind, sniff
 from stillpath.gcode.errors import GcodeError
+from tests.checkout import PYTHONPATH
 from tests.gcode.container_files import binary, members, package, refused, rewritten, text_of
 
 TEXT = b"G28\nG1 X10 Y5 F6000\r\n\nG1X20"
@@ -217,7 +218,7 @@ def test_nothing_is_left_of_a_killed_writer(tmp_path: Path, content: bytes):
     """
     code = textwrap.dedent(program)
     done = subprocess.run(
-        [sys.executable, "-c", code, str(source)], env={**os.environ, "PYTHONPATH": str(Path.cwd())}
+        [sys.executable, "-c", code, str(source)], env={**os.environ, "PYTHONPATH": PYTHONPATH}
     )
     assert done.returncode == -signal.SIGKILL
     assert source.read_bytes() == content
@@ -255,7 +256,7 @@ def test_memory_does_not_grow_with_the_file(tmp_path: Path, kind: str):
     for size in (1_000_000, 20_000_000):
         done = subprocess.run(
             [sys.executable, "-c", textwrap.dedent(program), str(source), str(size)],
-            env={**os.environ, "PYTHONPATH": str(Path.cwd()), "TMPDIR": str(tmp_path)},
+            env={**os.environ, "PYTHONPATH": PYTHONPATH, "TMPDIR": str(tmp_path)},
             capture_output=True,
             text=True,
             check=True,

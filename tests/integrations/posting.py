@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from tests.checkout import PYTHONPATH
+
 __all__ = ["PROGRAM", "ROOT", "environment", "finish", "post", "start"]
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -21,7 +23,7 @@ def environment(folder: Path, **more: str) -> dict[str, str]:
     return kept | {
         "XDG_CONFIG_HOME": str(folder / "config"),
         "XDG_DATA_HOME": str(folder / "data"),
-        "PYTHONPATH": str(ROOT),
+        "PYTHONPATH": PYTHONPATH,
         **more,
     }
 

@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
+from tests.checkout import PYTHONPATH
 from tests.integrations.octoprint import OctoPrint, install, octoprint_program, until
-from tests.integrations.posting import ROOT
 from tests.integrations.running import Running
 
 pytestmark = pytest.mark.slow
@@ -210,7 +210,7 @@ def test_what_is_printed_is_not_replaced(octoprint: OctoPrint):
 def test_the_program_on_this_computer(octoprint: OctoPrint, tmp_path: Path):
     program = tmp_path / "my stillpath"
     program.write_text(
-        f"#!/bin/sh\nPYTHONPATH={shlex.quote(str(ROOT))} exec {shlex.quote(sys.executable)} "
+        f"#!/bin/sh\nPYTHONPATH={shlex.quote(PYTHONPATH)} exec {shlex.quote(sys.executable)} "
         "-c 'from stillpath.cli.main import main; main()' \"$@\"\n"
     )
     program.chmod(0o755)

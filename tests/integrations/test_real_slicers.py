@@ -139,7 +139,10 @@ def test_prusaslicer_compensates_at_export(tmp_path: Path):
     assert made.count(b";LAYER_CHANGE") == 2
     assert b"; prusaslicer_config = end" in made
     names = {p.name for p in target.parent.iterdir()}
-    assert names == {target.name, "it's büste.stillpath.html"}
+    report = target.with_name("it's büste.stillpath.html")
+    assert names == {target.name, report.name}
+    # Scripts get the whole file, with its end.
+    assert "it was cut off" not in report.read_text()
 
 
 @pytest.mark.parametrize(
@@ -229,7 +232,8 @@ def test_layers_of_cura_engine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     assert made[0].endswith(";POSTPROCESSED\n")
     for before, after in zip(layers[1:], made[1:], strict=True):
         assert after.splitlines()[0] == before.splitlines()[0]
-    assert (tmp_path / "reports" / "part.stillpath.html").is_file()
+    report = tmp_path / "reports" / "part.stillpath.html"
+    assert "it was cut off" not in report.read_text()
     # As a whole it is what the program makes of the whole file.
     whole = tmp_path / "whole.gcode"
     whole.write_text(text)

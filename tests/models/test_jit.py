@@ -16,6 +16,7 @@ import pytest
 from numba.core.caching import IndexDataCacheFile
 
 from stillpath.models import jit
+from tests.checkout import PYTHONPATH
 
 ROOT = Path(jit.__file__).parents[1]
 CALLER = """
@@ -127,7 +128,7 @@ def test_a_kernel_from_disk_is_called_by_one_that_is_not(tools, tmp_path: Path) 
     found = [
         subprocess.run(
             [sys.executable, "-B", "-c", script.format(first, f"{then}, c.outer.stats.cache_hits")],
-            env=os.environ | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"},
+            env=os.environ | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{PYTHONPATH}"},
             capture_output=True,
             check=True,
             text=True,

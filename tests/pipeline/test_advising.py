@@ -383,3 +383,49 @@ def test_a_file_larger_than_it_may_be_is_refused(tmp_path: Path, cache: Path) ->
     result, written = advise(data, tmp_path, machine_of(Klipper()), cache, max_mb=2.0 * size_mb)
     assert result.put_back == []
     assert len(data) < len(written) < 2 * len(data)
+
+
+def tower(setting: str, head: str = HEAD) -> bytes:
+    """A wall whose layers follow a setting each; `{}` is the number of the layer."""
+    lines = [head]
+    for k in range(6):
+        lines += [";LAYER_CHANGE", f";Z:{0.2 * (k + 1):.1f}", f"G1 Z{0.2 * (k + 1):.2f} F900"]
+        lines += [setting.replace("{}", str(k + 1)), ";TYPE:External perimeter"]
+        lines += ["G1 X120 Y100 F9000", *polygon(7, 13)]
+    return "\n".join([*lines, "END_PRINT", ""]).encode()
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        (tower("SET_INPUT_SHAPER SHAPER_FREQ_X={}5 SHAPER_FREQ_Y={}5"), "SET_INPUT_SHAPER from"),
+        (tower("SET_VELOCITY_LIMIT ACCEL={}000"), "4000 mm/s2 is number 4"),
+        (
+            tower(
+                "; layer {}",
+                head=HEAD + "TUNING_TOWER COMMAND=SET_VELOCITY_LIMIT PARAMETER=ACCEL START=900\n",
+            ),
+            "TUNING_TOWER (line 6)",
+        ),
+    ],
+)
+@pytest.mark.parametrize("options", [{}, {"budget_um": 5.0}])
+def test_what_a_test_of_settings_tries_is_not_replaced(
+    data: bytes, said: str, options: dict[str, float], tmp_path: Path, cache: Path
+) -> None:
+    """Each layer got our shaper and acceleration, so that all layers of the tower were alike."""
+    result, written = advise(data, tmp_path, machine_of(Klipper()), cache, **options)
+    ours = [line for line in written.splitlines() if MARK in line]
+    assert all(line.startswith(b";") for line in ours)
+    assert without(written) == data
+    assert said in next(text for text in result.warnings if text.startswith("No advice is given"))
+    assert not [text for text in result.warnings if "larger budget" in text]
+
+
+@pytest.mark.parametrize("setting", ["SET_VELOCITY_LIMIT ACCEL=2000", "M204 S1000\nM204 S2000"])
+def test_a_file_with_the_same_settings_in_all_layers_is_no_test(
+    setting: str, tmp_path: Path, cache: Path
+) -> None:
+    result, written = advise(tower(setting), tmp_path, machine_of(Klipper()), cache)
+    assert not [text for text in result.warnings if text.startswith("No advice")]
+    assert b"SET_INPUT_SHAPER" in written

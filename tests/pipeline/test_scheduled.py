@@ -22,6 +22,7 @@ from stillpath.models.store import load_machine
 from stillpath.pipeline.band import NOTABLE_UM, BandContent
 from stillpath.pipeline.operating_point import Operation
 from stillpath.pipeline.simulate import simulate_file
+from tests.checkout import PYTHONPATH
 from tests.compensating import compensated
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -224,7 +225,7 @@ def test_bed_that_grows_heavier(tmp_path: Path) -> None:
     report = tmp_path / "rows.json"
     script = ROOT / "benchmarks" / "bed_slinger.py"
     chosen = ["--kg", "0.125", "--moving-kg", "0.2", "--json", str(report)]
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(tmp_path)}
+    environment = os.environ | {"PYTHONPATH": PYTHONPATH, "XDG_CACHE_HOME": str(tmp_path)}
     subprocess.run([sys.executable, str(script), *chosen], check=True, env=environment)
     none, fixed, scheduled = json.loads(report.read_text())
     assert none["last_rms"] > fixed["last_rms"] > 5 * scheduled["last_rms"]

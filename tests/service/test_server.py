@@ -17,6 +17,7 @@ import httpx2
 import psutil
 import pytest
 
+from tests.checkout import PYTHONPATH
 from tests.service.jobs.site import STILLPATH, until
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -34,7 +35,7 @@ def server(
         stdout=subprocess.PIPE,
         stderr=None if log is None else stack.enter_context(log.open("wb")),
         text=True,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        env=os.environ | {"PYTHONPATH": PYTHONPATH},
         cwd=data_dir,
     )
     try:

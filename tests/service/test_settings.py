@@ -61,3 +61,16 @@ def test_an_empty_variable_is_none(monkeypatch: pytest.MonkeyPatch):
     for name in names:
         monkeypatch.setenv(name, "")
     assert (service_settings(), MachineSettings.from_environment()) == expected
+
+
+def test_what_workers_elsewhere_cannot_reach_is_named_with_its_value(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    """The message said to set the variable that was set, to a folder."""
+    monkeypatch.setenv("STILLPATH_SCHEDULER", "tcp://10.0.0.1:8786")
+    monkeypatch.setenv("STILLPATH_STORAGE_URL", "file:///mnt/jobs")
+    with pytest.raises(ModelError) as refused:
+        service_settings()
+    said = str(refused.value)
+    assert "STILLPATH_DATABASE_URL is not set (postgresql://...)" in said
+    assert "STILLPATH_STORAGE_URL is file:///mnt/jobs (s3://bucket/prefix)" in said

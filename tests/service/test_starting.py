@@ -15,8 +15,9 @@ import pytest
 from stillpath.service import server
 from stillpath.service.server import serve_forever
 from stillpath.service.settings import Settings
+from tests.checkout import PYTHONPATH
 from tests.service.jobs.site import STILLPATH
-from tests.service.test_server import REAL, ROOT
+from tests.service.test_server import REAL
 
 pytestmark = pytest.mark.slow
 
@@ -28,7 +29,7 @@ def start(data_dir: Path, **settings: str) -> subprocess.Popen[str]:
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env=os.environ | {"PYTHONPATH": str(ROOT)} | given,
+        env=os.environ | {"PYTHONPATH": PYTHONPATH} | given,
     )
 
 

@@ -13,6 +13,7 @@ from typing import Any
 
 import httpx2
 
+from tests.checkout import PYTHONPATH
 from tests.service.jobs.site import until
 from tests.service.test_server import REAL
 
@@ -53,7 +54,7 @@ class Service:
 @contextmanager
 def running(data_dir: Path, key: str | None = None, **environment: str) -> Iterator[Service]:
     """Run `stillpath serve`; its log lies in the folder."""
-    variables = os.environ | {"PYTHONPATH": str(ROOT)} | environment
+    variables = os.environ | {"PYTHONPATH": PYTHONPATH} | environment
     headers = {} if key is None else {"X-Api-Key": key}
     data_dir.mkdir(parents=True, exist_ok=True)
     with (data_dir / "log").open("w") as log:

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from stillpath.service.processes import METHOD, loaded_context
+from tests.checkout import PYTHONPATH
 from tests.service.jobs.site import STILLPATH
 
 ROOT = Path(__file__).parents[3]
@@ -62,7 +63,7 @@ def start(folder: Path, *more: str) -> subprocess.Popen[str]:
     arguments = ["batch", str(folder), "-m", "ender3", "-o", str(folder.parent / "out"), *more]
     return subprocess.Popen(
         [*STILLPATH, *arguments],
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        env=os.environ | {"PYTHONPATH": PYTHONPATH},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

@@ -24,6 +24,7 @@ from stillpath.cli.batch.output import Outcome, OutputFolder
 from stillpath.cli.batch.watching import Watcher
 from stillpath.cli.batch.worker_pool import LocalBackend, worker_pool
 from stillpath.pipeline.options import Options
+from tests.checkout import PYTHONPATH
 from tests.cli.batch.pretending import PretendedWorker
 from tests.service.machines import make_machine, with_accel
 
@@ -91,6 +92,25 @@ def test_a_file_is_done_when_it_has_stopped_growing(folder):
         assert watch.until_quiet() == []
     assert results(folder) == ["ender3/a.stillpath.gcode"]
     assert (folder / "a.gcode").read_text().startswith("G28")
+
+
+def test_a_copy_that_came_to_a_halt_is_waited_for(folder):
+    """Its slicer's last comment is missing; half of the file was compensated after two seconds."""
+    head = ";FLAVOR:Marlin\n;Generated with Cura_SteamEngine 5.10.2\nG28\nG1 X1\n"
+    with watching(folder) as watch:
+        (folder / "a.gcode").write_text(head)
+        for _ in range(30):
+            assert watch.look()
+        assert not watch.told
+        (folder / "a.gcode").write_text(head + "G1 X2\nM104 S0\n;End of Gcode\n")
+        assert [o.state for o in watch.until_quiet()] == ["done"]
+        assert (folder.parent / "out/ender3/a.stillpath.gcode").read_text().endswith("Gcode\n")
+        (folder / "b.gcode").write_text(head)
+        assert watch.look()
+        assert watch.look(after_s=30.0)
+        assert len(watch.told) == 1
+        watch.look(after_s=31.0)
+        assert [o.state for o in watch.until_quiet()] == ["done"]
 
 
 def test_atomic_renames(folder):
@@ -283,7 +303,7 @@ def test_killed_again_and_again(tmp_path):
         f"sys.exit(run(['watch', {str(folder)!r}, '-m', 'ender3', '-o', {str(out)!r},"
         " '--settle-s', '0.2', '--every-s', '0.5', '--jobs', '2']))\n"
     )
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "PRETENDED_DELAY_S": "0.15"}
+    environment = os.environ | {"PYTHONPATH": PYTHONPATH, "PRETENDED_DELAY_S": "0.15"}
     rng = random.Random(7)
     names = [f"part{n:02}" for n in range(12)]
     told: Counter[str] = Counter()

@@ -160,6 +160,18 @@ def test_lines_are_found_among_ours(golden_machine: Machine) -> None:
     assert target.getvalue().endswith(b";TIME:180\n")
 
 
+def test_the_number_of_lines_is_that_of_the_written_file(golden_machine: Machine) -> None:
+    """A Snapmaker's screen shows the progress by it, and went far beyond 100 %."""
+    (item,) = verbatim_parts_of(b";file_total_lines: 4\nG1 X1 F600\nG1 X2\nM84\n", golden_machine)
+    ours = item.text.replace(b"G1 X2\n", 20 * b"G1 X1.5\n")
+    retiming = Retiming(b"; head\n", b"; tail\n")
+    retiming.push(ours, item, 0.0)
+    target = io.BytesIO()
+    retiming.copy(io.BytesIO(ours), target, 0.0)
+    written = target.getvalue()
+    assert told(written, b";file") == [b";file_total_lines: %d" % written.count(b"\n")]
+
+
 def test_metadata_tells_the_whole() -> None:
     text = b"filament used [g]=3.1\nestimated printing time (normal mode)=32m 6s\n"
     assert retimed(text, 54.0) == (

@@ -35,6 +35,9 @@ K = TimeKind
         (b"; Estimated-in-GUI Build Time:         10.18 minutes\n", [(K.TOTAL, 610.8, False)]),
         (b"; --- print time: 806s ---\n", [(K.TOTAL, 806.0, False)]),
         (b";estimated_time(s): 9602.18\n", [(K.TOTAL, 9602.18, False)]),
+        (b";   Build time: 1 hour 23 minutes\n", [(K.TOTAL, 4980.0, False)]),
+        (b";   Build Time: 0 hours 1 minute\r\n", [(K.TOTAL, 60.0, False)]),
+        (b";file_total_lines: 10371\n", [(K.LINES, 10371.0, False)]),
         (b"M73 P3 R27\n", [(K.PERCENT, 3.0, False), (K.REMAINING, 1620.0, False)]),
         (b"M73 Q0 S12 ; silent\n", [(K.PERCENT, 0.0, True), (K.REMAINING, 720.0, True)]),
         (b"M73 C5\n", [(K.UNTIL_STOP, 300.0, False)]),
@@ -87,6 +90,7 @@ def test_other_lines_tell_no_time(line: bytes) -> None:
         (b"; estimated first layer printing time (normal mode) = 0.815957s\n", 1.5, b"1.500000s"),
         (b"; Calculated-during-export Build Time: 10.16 minutes\n", 612.0, b"10.20"),
         (b";TIME:5\n", -3.0, b"0"),
+        (b";   Build time: 0 hours 59 minutes\n", 3630.0, b"1 hours 1 minutes"),
     ],
 )
 def test_another_time_in_the_same_form(line: bytes, seconds: float, written: bytes) -> None:

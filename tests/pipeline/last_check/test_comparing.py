@@ -460,6 +460,32 @@ LIFTED_AGAIN = (
 )
 
 
+FEED_AFTER_REPEATED = """\
+G28
+M82
+G1 X50 Y50 Z.2 F6000
+G1 X50.01 Y50 E1
+G1 X50.01 Y50 E1
+G1 F1500
+G1 X70 Y60 E2
+M105
+"""
+
+FILAMENT_AFTER_REPEATED = """\
+G28
+M82
+G1 X50 Y50 Z.2 F6000
+G1 X50 Y50.005 F6000
+G1 X50 Y50
+G1 X50.01 Y50 E5
+G1 X50 Y50 E6
+G1 X50 Y50
+G1 X60 Y80 E8
+G1 X60 Y80 E9
+G1 X50 Y50 E10
+M105
+"""
+
 LAYER_AGAIN = (
     "G28\nM82\nG92 E0\nG1 Z.2 F600\n"
     + "".join(
@@ -482,6 +508,10 @@ LAYER_AGAIN = (
         pytest.param("marlin", FILAMENT, id="filament"),
         # A line that stands still moves what the short one before it left.
         pytest.param("marlin", SHORT, id="short"),
+        # F or filament alone, after lines of one text of which nobody knows which moved.
+        pytest.param("marlin", FEED_AFTER_REPEATED, id="F after repeated"),
+        pytest.param("marlin", FEED_AFTER_REPEATED.replace("G1 F", "G0 F"), id="F of G0"),
+        pytest.param("marlin", FILAMENT_AFTER_REPEATED, id="filament after repeated"),
         # Several lines of one text, and nobody knows which of them moved.
         pytest.param("marlin", REPEATED, id="repeated"),
         # G10 retracts, whatever words it has: they say nothing of where E is.

@@ -164,7 +164,7 @@ def test_kernels_read_as_the_slow_way_does(lines: list[str]) -> None:
     nothing, (before, behind) = np.frombuffer(b"", np.uint8), np.zeros((2, at.SIZE))
     words, near_mm = np.zeros(at.WORD_COUNT), np.zeros(3)
     found = at.ours(
-        text, 0, len(text), quick.state, words, nothing, False, before, behind, near_mm, 0.0
+        text, 0, len(text), quick.state, words, nothing, False, False, before, behind, near_mm, 0.0
     )
     assert found == (len(text), len(moves), False, at.SAME)
     known = slice(at.WAITS)  # moves of ours do not wait

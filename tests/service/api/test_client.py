@@ -22,9 +22,10 @@ from stillpath.cli import main
 from stillpath.service.api.schemas import JobView
 from stillpath.service.client import Client, ClientError
 from stillpath.service.connection import Connection
+from tests.checkout import PYTHONPATH
 from tests.integrations.breaking import BODY, TAKES_S, breaking_server
 from tests.service.jobs.site import STILLPATH
-from tests.service.test_server import PRETEND, ROOT, server, until
+from tests.service.test_server import PRETEND, server, until
 
 
 @pytest.fixture(scope="module")
@@ -458,7 +459,7 @@ def test_an_interrupted_command_cancels_its_job(address: str, client: Client, tm
         [*command, "--server", address],
         stderr=subprocess.PIPE,
         text=True,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        env=os.environ | {"PYTHONPATH": PYTHONPATH},
     )
     job = until(lambda: next(iter(client.jobs(state=["running"])), None))
     process.send_signal(signal.SIGTERM)

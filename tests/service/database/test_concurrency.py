@@ -29,6 +29,7 @@ from stillpath.service.jobs.state import Cancelled, Event, Failed, JobState, Los
 from stillpath.service.jobs.store import JobStore
 from stillpath.service.jobs.submissions import Quota, QuotaExceeded
 from stillpath.service.settings import Settings
+from tests.checkout import PYTHONPATH
 from tests.service.at_once import at_once
 from tests.service.database.examples import finished, make_job, take_all
 
@@ -151,7 +152,7 @@ def process(settings: Settings, code: str) -> subprocess.Popen[str]:
         stdout=subprocess.PIPE,
         text=True,
         cwd=ROOT,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        env=os.environ | {"PYTHONPATH": PYTHONPATH},
     )
 
 

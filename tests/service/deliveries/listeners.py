@@ -133,6 +133,8 @@ def moonraker(
         if key is not None and seen.headers.get("x-api-key") != key:
             return _told(401, {"error": {"code": 401, "message": "Unauthorized"}})
         place, _, query = seen.path.partition("?")
+        if place == "/server/info":
+            return _told(200, {"result": {"klippy_connected": state != "away"}})
         if status is not None and seen.method == "GET" and place.startswith("/printer/"):
             if state == "away":
                 return _told(503, {"error": {"code": 503, "message": "Klippy Host not connected"}})
@@ -175,6 +177,8 @@ def octoprint(*, key: str, can_print: bool = True) -> Iterator[Listener]:
     def answer(seen: Seen) -> Answer:
         if seen.headers.get("x-api-key") != key:
             return _told(403, {"error": "You don't have the permission to access this"})
+        if seen.path.endswith("/api/version"):
+            return _told(200, {"api": "0.1", "server": "1.11.3", "text": "OctoPrint 1.11.3"})
         if (seen.method, seen.path) != ("POST", "/octo/api/files/local"):
             return _told(404, {"error": "Not found"})
         parts = seen.parts()

@@ -300,9 +300,19 @@ def test_a_printer_that_is_off_and_an_octoprint(tmp_path: Path):
     checker = Checker(DocumentFolder(tmp_path))
     with pytest.raises(PrinterUnknown, match="cannot be reached"):
         checker.check(off, MACHINE)
-    with octoprint(key="k") as server, pytest.raises(PrinterUnknown, match="OctoPrint"):
+    with octoprint(key="k") as server, pytest.raises(PrinterUnknown, match="is an OctoPrint"):
         checker.check(printer_at(server, kind="octoprint"), MACHINE)
-    assert server.seen == []
+
+
+def test_a_printer_of_the_other_kind_is_named(tmp_path: Path):
+    """It was said to be away, or to be an OctoPrint."""
+    checker = Checker(DocumentFolder(tmp_path))
+    said = r'kind octoprint, but at http\S+ answers a Moonraker: set kind = "moonraker" in \[pr'
+    with moonraker() as server, pytest.raises(PrinterUnknown, match=said):
+        checker.check(printer_at(server, kind="octoprint"), MACHINE)
+    said = r'kind moonraker, but at http\S+ answers an OctoPrint: set kind = "octoprint"'
+    with octoprint(key="k") as server, pytest.raises(PrinterUnknown, match=said):
+        checker.check(printer_at(server, api_key="k"), MACHINE)
 
 
 # When a result is handed over
@@ -455,6 +465,14 @@ def test_on_the_command_line(tmp_path: Path, monkeypatch, capsys):
         assert "unsafe" not in capsys.readouterr().out
         accept = ["printers", "accept", "left", "--printers", str(file)]
         assert run(accept) == 0
+        # A file on the command line is meant, whatever server the environment names.
+        monkeypatch.setenv("STILLPATH_SERVER", "http://127.0.0.1:9")
+        assert run(accept) == 0
+        assert run(command) == 2
+        assert "unsafe: [gcode_macro" in capsys.readouterr().out
+        assert run([*command, "--server", "http://127.0.0.1:9"]) == 2
+        assert "either --printers FILE or --server URL" in capsys.readouterr().err
+        monkeypatch.delenv("STILLPATH_SERVER")
         assert run(["printers", "check", "nobody", "--printers", str(file)]) == 2
         assert "known: advised, left, octo" in capsys.readouterr().err
     assert run(command) == 2

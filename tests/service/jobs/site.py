@@ -22,6 +22,7 @@ from stillpath.service.jobs.store import JobStore
 from stillpath.service.jobs.sweep import sweep_files
 from stillpath.service.settings import Settings
 from stillpath.service.storage.factory import open_storage
+from tests.checkout import PYTHONPATH
 from tests.service.database.examples import make_job
 
 __all__ = ["ROOT", "STILLPATH", "Process", "Site", "until"]
@@ -48,7 +49,7 @@ class Site:
         self.settings = Settings(data_dir=data_dir, **settings)  # type: ignore[arg-type]
         self.environment = {
             "STILLPATH_DATA_DIR": str(data_dir),
-            "PYTHONPATH": str(ROOT),
+            "PYTHONPATH": PYTHONPATH,
             **{f"STILLPATH_{name.upper()}": str(value) for name, value in settings.items()},
         }
         self.engine = open_database(self.settings)

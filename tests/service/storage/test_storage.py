@@ -257,6 +257,10 @@ def test_the_settings_choose(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     for wrong in ("ftp://b", "s3://", "s3://b?what=1", "file:relative", "file:", "file://"):
         with pytest.raises(ValueError, match="s3://bucket"):
             open_storage(Settings(data_dir=tmp_path, storage_url=wrong))
+    (tmp_path / "plain").write_text("no folder")
+    below = Settings(data_dir=tmp_path, storage_url=(tmp_path / "plain" / "jobs").as_uri())
+    with pytest.raises(StorageError, match="STILLPATH_STORAGE_URL; make the folder"):
+        open_storage(below)
 
 
 def test_a_disk_that_is_away_is_an_error_and_nothing_goes_to_another(tmp_path: Path):
