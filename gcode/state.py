@@ -7,7 +7,7 @@ kernel does not know are functions of this state, one module of them per firmwar
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,7 +34,7 @@ from stillpath.gcode.types import KEPT, OF_STATE, EventKind, Limits
 from stillpath.models.firmware import FirmwareFacts, FirmwareRetraction, Marlin, RepRapFirmware
 from stillpath.models.machine import Machine
 
-__all__ = ["EXTRUDER_MODE", "MachineState", "Names", "Retraction", "Saved", "nobody"]
+__all__ = ["EXTRUDER_MODE", "MachineState", "Names", "Retraction", "Saved"]
 
 EXTRUDER_MODE = "extruder mode"
 """Why moves are held that feed filament before the file says M82 or M83."""
@@ -84,8 +84,6 @@ class MachineState:
     buffer, span : ndarray, (int, int)
         The text that is being read, and where the line in hand begins (after blanks and its
         number) and ends in it.
-    carry_out : function
-        Carries out another command of the same line (the interpreter's).
     held : dict of str to bool
         Why moves stay as they are (`hold`).
     laser_mode : bool
@@ -131,7 +129,6 @@ class MachineState:
         self.warnings: dict[str, int] = {}
         self.notes: dict[str, int] = {}
         self.layer_style: str | None = None
-        self.carry_out: Callable[[Command], int] = nobody
         self.buffer = np.zeros(0, np.uint8)
         self.span = (0, 0)
         self.remembers = True
@@ -442,11 +439,6 @@ class Names:
         other = Names()
         other.names, other._numbers = self.names.copy(), self._numbers.copy()
         return other
-
-
-def nobody(command: Command) -> int:
-    """Carry out commands while nothing is read: there are none."""
-    raise RuntimeError(f"no handler for {command.name}")
 
 
 def _set_arcs(f: NDArray[np.float64], firmware: FirmwareFacts) -> None:
