@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from stillpath.compensation.base import DesignError
+from stillpath.compensation.defaults import DT_S
 from stillpath.compensation.live_filter import LiveFilter, design_taps, exact_moments, shaper_taps
 from stillpath.models.arrays import Array
 from stillpath.models.machine import Machine, MotorLimits
@@ -35,7 +36,6 @@ from stillpath.pipeline.measuring.reference_shaper import BestShaper, cached_sha
 
 __all__ = ["LiveDesign", "cached_live_design", "design_live", "live_filter"]
 
-DT_S = 1e-3
 _VERSION = 8
 """Part of the cache's name; rises when the design changes."""
 _CORNERS_HZ = (70.0, 90.0, 115.0, 150.0, 200.0, 270.0)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillpath.compensation.base import Compensator, DesignError
 from stillpath.compensation.cautious import Caution
+from stillpath.compensation.defaults import DT_S
 from stillpath.compensation.registry import compensator
 from stillpath.compensation.scheduled import BLEND_STEP, DESIGN_STEP
 from stillpath.compensation.window_problem import TRAVEL_SLACK_MM
@@ -18,7 +18,6 @@ from stillpath.gcode.firmware.encoding import Encoded
 from stillpath.gcode.firmware.planning import intended
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.pieces import Piece
-from stillpath.gcode.sampler import distances, sample_phases, sample_until
 from stillpath.gcode.segments import ErrorFilter, Segments, fit_segments
 from stillpath.gcode.timeline import Group, Timeline, build_timeline, group_rows
 from stillpath.gcode.types import Phases
@@ -27,6 +26,7 @@ from stillpath.models.operating import OperatingGrid, machine_at
 from stillpath.models.plants import plant_set
 from stillpath.models.schedule import EMPTY, OperatingPoint
 from stillpath.pipeline.caution import design_mode, set_or_nominal
+from stillpath.pipeline.compensated_piece import CompensatedPiece, Unfit, deviation
 from stillpath.pipeline.filament import feed_evenly, retract_along
 from stillpath.pipeline.following import follow_tolerance_mm, strayed
 from stillpath.pipeline.measuring._peak_kernels import peaks, speed_steps
@@ -34,17 +34,7 @@ from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.pipeline.options import COARSE_UM, Options
 from stillpath.pipeline.standing import Standing
 
-__all__ = [
-    "DT_S",
-    "CompensatedPiece",
-    "PieceCompensator",
-    "Unfit",
-    "as_executed",
-    "deviation",
-]
-
-DT_S = 1e-3
-"""Sampling time of paths and commands: finer changes contour errors by hundredths of a um."""
+__all__ = ["PieceCompensator"]
 
 _REST_TOLERANCE_S = 5e-3
 _ROUNDS = 2
@@ -63,38 +53,8 @@ _SLACK = 1.0 + 1e-9
 """Factor of limits that allows for rounding."""
 
 
-class Unfit(ValueError):
-    """A piece that should stay as sliced; the message says why."""
-
-
 class _TooAbrupt(Unfit):
     """A motor's speed step is too large, or the firmware cannot follow within its limits."""
-
-
-@dataclass(frozen=True, slots=True)
-class CompensatedPiece:
-    """A piece with its command.
-
-    Attributes
-    ----------
-    command_mm : ndarray, shape (4, n)
-        x y as commanded, z as planned, e along the command (`pipeline.filament`), on the
-        timeline's grid.
-    extruding : ndarray of bool, shape (n,)
-    step_mm, bend_mm : float
-        Longest step of the command in XY, and largest second difference of either axis.
-    keeps_ripple : bool
-        Its ripple is not compensated, although that was asked for.
-    """
-
-    timeline: Timeline
-    command_mm: NDArray[np.float64]
-    extruding: NDArray[np.bool_]
-    segments: Segments
-    encoded: Encoded
-    step_mm: float
-    bend_mm: float
-    keeps_ripple: bool
 
 
 class PieceCompensator:
@@ -429,52 +389,3 @@ def _mean(path_mm: NDArray[np.float64], reach: int) -> NDArray[np.float64]:
 
 def _error_filter(machine: Machine) -> ErrorFilter:
     return ErrorFilter([plant_set(machine.axes[a], DT_S).nominal for a in ("x", "y")])
-
-
-def deviation(piece: CompensatedPiece, executed: Phases) -> NDArray[np.float64]:
-    """Return the XY distance [mm] of executed motion from the command at its samples, shape (n,).
-
-    Each stretch is timed from its own start: rests may be slightly longer or shorter than planned.
-    """
-    timeline, encoded = piece.timeline, piece.encoded
-    first = np.round(timeline.start_s / timeline.dt_s - 0.5).astype(np.int64)
-    np.clip(first, 0, piece.command_mm.shape[1], out=first)
-    first[0] = 0
-    origin_s = timeline.start_s[0]
-    return distances(
-        executed,
-        piece.command_mm,
-        timeline.dt_s,
-        first,
-        encoded.group_start_s - timeline.start_s - origin_s,
-        # During a rest, time stops at the beginning of the next stretch.
-        np.append(encoded.group_start_s[1:], np.inf) - origin_s,
-    )
-
-
-def as_executed(
-    piece: CompensatedPiece, phases: Phases, executed: Phases
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64], NDArray[np.bool_]]:
-    """Return planned and executed motion of a piece on one time grid.
-
-    Parameters
-    ----------
-    phases : Phases
-        The intended motion (`gcode.firmware.planning.intended`).
-
-    Returns
-    -------
-    planned_mm, executed_mm : ndarray, shapes (3, n) and (2, n)
-    row : ndarray of int64, shape (n,)
-        Row in the piece's `phases`.
-    extruding : ndarray of bool, shape (n,)
-    """
-    dt_s = piece.timeline.dt_s
-    origin = float(piece.timeline.start_s[0])
-    last = executed.lasts_s[-1]
-    n = int(np.ceil((float(executed.t_s[-1] + last) + origin) / dt_s - 1e-3)) + 1
-    moved = replace(phases, t_s=piece.encoded.row_start_s)
-    until = np.where(phases.prints, moved.t_s + phases.lasts_s, -np.inf)
-    planned, row, extruding = sample_until(moved, (0.0, dt_s, n), until, axes=3)
-    position, _ = sample_phases(executed, (-origin, dt_s, n), flat=True)
-    return planned, position, row, extruding

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, BinaryIO
 import numpy as np
 
 from stillpath.compensation.base import DesignError
+from stillpath.compensation.defaults import DT_S
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.planning import join_phases
 from stillpath.gcode.firmware.registry import adapter
@@ -30,6 +31,7 @@ from stillpath.gcode.splitter import Splitter
 from stillpath.gcode.types import Events, Moves, Phases, ProgramBlock
 from stillpath.models.errors import ModelError
 from stillpath.pipeline.clock import StageClock
+from stillpath.pipeline.compensated_piece import CompensatedPiece, Unfit, deviation
 from stillpath.pipeline.endless import LengthGuard
 from stillpath.pipeline.file_dialect import (
     dialect_for,
@@ -52,12 +54,6 @@ from stillpath.pipeline.pacing.budget import SpeedBudget
 from stillpath.pipeline.pacing.budget_measure import BudgetMeasurement
 from stillpath.pipeline.pacing.samples import take_samples
 from stillpath.pipeline.parts import FileParts
-from stillpath.pipeline.piece_compensator import (
-    DT_S,
-    CompensatedPiece,
-    Unfit,
-    deviation,
-)
 from stillpath.pipeline.progress import ProgressReports
 from stillpath.pipeline.result import PutBack, Result, StageTime
 from stillpath.pipeline.selection import Selection, TooLarge

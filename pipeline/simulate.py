@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from stillpath.compensation.defaults import DT_S
 from stillpath.compensation.live_filter import LiveFilter
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.signatures import signed_at
@@ -28,7 +29,6 @@ from stillpath.pipeline.measuring.reference_shaper import cached_shaper
 from stillpath.pipeline.measuring.tracing import Trace
 from stillpath.pipeline.operating_point import Operation
 from stillpath.pipeline.options import DialectName
-from stillpath.pipeline.piece_compensator import DT_S
 from stillpath.pipeline.progress import ProgressCallback
 from stillpath.pipeline.result import NOTHING_COMPENSATED, Result
 from stillpath.pipeline.shaping import ShapedMotion

@@ -15,6 +15,7 @@ from typing import Any, BinaryIO, TypeVar
 
 import numpy as np
 
+from stillpath.compensation.defaults import DT_S
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.interpreter import Interpreter
@@ -49,7 +50,6 @@ from stillpath.pipeline.measuring.set_errors import ClassError, SetErrors
 from stillpath.pipeline.operating_point import Operation
 from stillpath.pipeline.options import Options, stamp
 from stillpath.pipeline.pacing.samples import take_samples
-from stillpath.pipeline.piece_compensator import DT_S
 from stillpath.pipeline.progress import ProgressCallback, ProgressReports
 from stillpath.pipeline.result import (
     NOTHING_COMPENSATED,

@@ -15,6 +15,7 @@ from functools import cache
 
 import numpy as np
 
+from stillpath.compensation.defaults import DT_S
 from stillpath.gcode.firmware.base import Adviser
 from stillpath.gcode.pacing import FirstLayer
 from stillpath.gcode.slicers.features import feature_of
@@ -33,7 +34,6 @@ from stillpath.pipeline.advising.trials import Trial
 from stillpath.pipeline.measuring.reference_shaper import FREQUENCIES_HZ, descend
 from stillpath.pipeline.measuring.set_errors import machine_numbers
 from stillpath.pipeline.pacing.samples import FileSamples
-from stillpath.pipeline.piece_compensator import DT_S
 
 __all__ = ["AsSliced", "Choice", "choose", "ladder"]
 

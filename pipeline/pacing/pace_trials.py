@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillpath.compensation.cautious import Caution
+from stillpath.compensation.defaults import DT_S
 from stillpath.compensation.shapers import shape_xy
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.planning import intended
@@ -17,11 +18,12 @@ from stillpath.gcode.pacing import AS_SLICED, Pace, paced
 from stillpath.gcode.pieces import Piece
 from stillpath.gcode.sampler import sample_phases
 from stillpath.models.machine import Machine
+from stillpath.pipeline.compensated_piece import Unfit, as_executed
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.pipeline.measuring.set_errors import ClassError, ErrorSum, SetErrors
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.pacing.samples import Sample
-from stillpath.pipeline.piece_compensator import DT_S, PieceCompensator, Unfit, as_executed
+from stillpath.pipeline.piece_compensator import PieceCompensator
 
 __all__ = ["Factors", "PaceTrials", "Tried", "compensated", "paces", "shaped"]
 
