@@ -11,7 +11,7 @@ from stillpath.compensation.base import Compensator, DesignError
 from stillpath.compensation.cautious import Caution
 from stillpath.compensation.defaults import DT_S
 from stillpath.compensation.registry import compensator
-from stillpath.compensation.scheduled import BLEND_STEP, DESIGN_STEP
+from stillpath.compensation.scheduled import DESIGN_STEP
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.encoding import Encoded
 from stillpath.gcode.firmware.planning import intended
@@ -21,7 +21,7 @@ from stillpath.gcode.segments import ErrorFilter, Segments, fit_segments
 from stillpath.gcode.timeline import Group, Timeline, build_timeline, group_rows
 from stillpath.gcode.types import Phases
 from stillpath.models.machine import Machine
-from stillpath.models.operating import OperatingGrid, machine_at
+from stillpath.models.operating import BLEND_STEP, OperatingGrid, machine_at
 from stillpath.models.plants import plant_set
 from stillpath.models.schedule import EMPTY, OperatingPoint
 from stillpath.pipeline.caution import design_mode, set_or_nominal

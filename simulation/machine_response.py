@@ -10,20 +10,16 @@ import numpy as np
 from stillpath.models.arrays import Array
 from stillpath.models.friction import DryFriction
 from stillpath.models.machine import Machine
-from stillpath.models.operating import OperatingGrid, machine_at
+from stillpath.models.operating import BLEND_STEP, REMEMBERED_S, OperatingGrid, machine_at
 from stillpath.models.plants import DiscretePlant, PlantSetSpec, discretise, plant_set
 from stillpath.models.ripple import MachineRipple
 from stillpath.models.schedule import EMPTY, OperatingPoint
 from stillpath.simulation.response import PlantStream
 
-__all__ = ["BLEND_STEP", "REMEMBERED_S", "SIMULATION_STEP", "MachineStream"]
+__all__ = ["SIMULATION_STEP", "MachineStream"]
 
 SIMULATION_STEP = 0.001
 """Ratio, minus 1, by which a resonance moves in mass or height before the plants are taken anew."""
-BLEND_STEP = 0.02
-"""The same from node to node in x and y."""
-REMEMBERED_S = 4.0
-"""How much of the past new plants are shown: vibrations of before have died down by then."""
 
 
 class MachineStream:

@@ -24,7 +24,7 @@ from stillpath.models.friction import usual_guides
 from stillpath.models.identification.conditioned import schedulable
 from stillpath.models.identification.conditions import Condition
 from stillpath.models.identification.identify import Measured, Progress, identify
-from stillpath.models.identification.readers import ReadSettings, read_content
+from stillpath.models.identification.readers import LARGEST_BYTES, ReadSettings, read_content
 from stillpath.models.identification.types import AccelerationLog, AxisIdentification, Spectrum
 from stillpath.models.machine import Machine
 from stillpath.models.plants import PlantSpec, discretise
@@ -34,7 +34,6 @@ from stillpath.models.user_files import read_bytes
 
 __all__ = ["Identified", "InputFile", "identify_files", "read_inputs"]
 
-LARGEST_BYTES = 200_000_000
 Axis: TypeAlias = Literal["x", "y"]
 
 

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from stillpath.cli.batch.output import Figures, Outcome, OutputFolder, sha256_of
+from stillpath.cli.batch.output import Figures, Outcome, OutputFolder
+from stillpath.service.storage.base import sha256_of
 from stillpath.service.storage.local import LocalStorage
 
 TEXT = "; compensated\nG28\n"
