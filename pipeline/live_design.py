@@ -172,7 +172,7 @@ class _Trial:
         best = min(accurate, key=lambda one: (one.corner_hz, one.ratio))
         command = self._command(best.taps)
         mixtures = self._mixtures
-        ratio = mixtures.errors_mm(mixtures.answers(command)) / mixtures.shaped_mm
+        ratio = mixtures.errors_mm(mixtures.responses(command)) / mixtures.shaped_mm
         channels = {"before": [self._path], "live": [command], "shaper": [self._smooth]}
         return LiveDesign(
             best.taps,
@@ -195,7 +195,7 @@ class _Trial:
             command = self._command(exact)
             if _peak(command) > self._machine.command.accel_mm_s2:
                 continue
-            cost = cache(partial(self._ratio, self._mixtures.answers(command)))
+            cost = cache(partial(self._ratio, self._mixtures.responses(command)))
             shares = best_shares(cost, most_shares)
             if shares != (0.0, 0.0) and np.isfinite(cost(shares)):
                 yield _Candidate(cost(shares), corner_hz, self._mixed(exact, shares), shares)

@@ -381,12 +381,12 @@ def _tuned(
     """Return the frequency indices of X and Y that minimise the worst member's error."""
 
     @cache
-    def answer(member: int, axis: int, number: int) -> np.ndarray:
-        return trial.axis_answer(member, axis, kind, float(FREQUENCIES_HZ[number]), at)
+    def response(member: int, axis: int, number: int) -> np.ndarray:
+        return trial.axis_response(member, axis, kind, float(FREQUENCIES_HZ[number]), at)
 
     @cache
     def rms(i: int, j: int) -> float:
-        return trial.rms([(answer(k, 0, i), answer(k, 1, j)) for k in range(members)], at)
+        return trial.rms([(response(k, 0, i), response(k, 1, j)) for k in range(members)], at)
 
     coarse = range(0, len(FREQUENCIES_HZ), _COARSE)
     if start is not None:

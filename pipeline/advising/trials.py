@@ -124,17 +124,17 @@ class Trial:
         """Return contour errors [mm] at chosen samples, shape (members, len(at))."""
         out = np.empty((len(self._members), len(at)))
         if not self._commutes:
-            for row, answer in zip(out, self._answers_to(self._command(shapings)), strict=True):
-                row[:] = self._distance.at(answer[:, at], at)
+            for row, response in zip(out, self._responses_to(self._command(shapings)), strict=True):
+                row[:] = self._distance.at(response[:, at], at)
             return out
-        for row, answer in zip(out, self._answers, strict=True):
+        for row, response in zip(out, self._responses, strict=True):
             y = np.empty((2, len(at)))
             if isinstance(shapings, Shaping):
-                self._shape(answer, shapings, at, y)
+                self._shape(response, shapings, at, y)
             else:
                 for first, last, point in self._bounds:
                     part = slice(*np.searchsorted(at, (first, last)).tolist())
-                    self._shape(answer, shapings[point], at[part], y[:, part])
+                    self._shape(response, shapings[point], at[part], y[:, part])
             row[:] = self._distance.at(y, at)
         return out
 
@@ -151,10 +151,10 @@ class Trial:
                 found.append(every[::step])
         return np.unique(np.concatenate(found)) if found else np.zeros(0, np.int64)
 
-    def axis_answer(self, member: int, axis: int, kind: str, f_hz: float, at: Ints) -> Array:
+    def axis_response(self, member: int, axis: int, kind: str, f_hz: float, at: Ints) -> Array:
         """Return one member's positions of one axis at chosen samples, under one shaper."""
         pulses = AxisShaper(kind, f_hz).pulses()
-        return shaped_at(self._answers[member][axis], self._dt_s, pulses, at)
+        return shaped_at(self._responses[member][axis], self._dt_s, pulses, at)
 
     def rms(self, positions: Sequence[tuple[Array, Array]], at: Ints) -> float:
         """Return the rms contour error [mm] of the worst of several motions."""
@@ -173,28 +173,28 @@ class Trial:
         return np.concatenate(parts, axis=1)
 
     @cached_property
-    def _answers(self) -> list[Array]:
-        return list(self._answers_to(self._path))
+    def _responses(self) -> list[Array]:
+        return list(self._responses_to(self._path))
 
-    def _answers_to(self, command_mm: Array) -> Iterator[Array]:
+    def _responses_to(self, command_mm: Array) -> Iterator[Array]:
         """Yield every member's positions; ripple and guides are the same for all of them."""
         received_mm = MachineStream(self._machine, self._dt_s).received_mm(command_mm)
         for member in self._members:
-            yield self._answer(member, received_mm)
+            yield self._response(member, received_mm)
 
-    def _answer(self, member: int | None, received_mm: Array) -> Array:
+    def _response(self, member: int | None, received_mm: Array) -> Array:
         parts = [np.zeros((2, 0))]
         stream: MachineStream | None = None
         for first, last, point in self._bounds:
             if stream is None:
                 stream = MachineStream(self._machine, self._dt_s, point, member=member)
             stream.operate_at(point)
-            parts.append(stream.answer(received_mm[:, first:last], self._path[:, first:last]))
+            parts.append(stream.respond(received_mm[:, first:last], self._path[:, first:last]))
         return np.concatenate(parts, axis=1)
 
-    def _shape(self, answer: Array, shaping: Shaping, at: Ints, out: Array) -> None:
+    def _shape(self, response: Array, shaping: Shaping, at: Ints, out: Array) -> None:
         for axis, shaper in enumerate((shaping.x, shaping.y)):
-            out[axis] = shaped_at(answer[axis], self._dt_s, shaper.pulses(), at)
+            out[axis] = shaped_at(response[axis], self._dt_s, shaper.pulses(), at)
 
 
 def _motion(
