@@ -371,7 +371,13 @@ class MachineState:
         return found
 
     def at_least(self, value: str, key: str, low: float, command: Command) -> float:
-        """Read a number that must not be below `low`."""
+        """Read a number that must not be below `low`.
+
+        Raises
+        ------
+        GcodeError
+            It is none, or below.
+        """
         number = self.number(value, key, command)
         if number < low:
             raise self.problem(f"{key}={value} must be at least {low:g}", command)

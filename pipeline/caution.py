@@ -222,11 +222,19 @@ class Mixtures:
         self.shaped_mm = np.maximum(self.errors_mm(self._smooth), 1e-12)
 
     def responses(self, command_mm: Array) -> list[Array]:
-        """Return the motion of every pair at the measured points."""
+        """Return the motion of every pair at the measured points, shape (2, points) each."""
         return [response(pair, command_mm)[:, self._at] for pair in self._pairs]
 
     def errors_mm(self, responses: Sequence[Array], shares: Shares = (1.0, 1.0)) -> Array:
-        """Return the rms error of every pair with a command, or with a mixture of it."""
+        """Return the rms contour errors [mm] with a command, or a mixture of it, shape (pairs,).
+
+        Parameters
+        ----------
+        responses : sequence of ndarray
+            To the command.
+        shares : (float, float)
+            Of the command on X and on Y; the rest is the shaper's.
+        """
         a = np.array(shares)[:, None]
         both = zip(responses, self._smooth, strict=True)
         return np.array([self._rms(a * exact + (1.0 - a) * smooth) for exact, smooth in both])
@@ -236,7 +244,7 @@ class Mixtures:
         return float(np.exp(self._weights @ np.log(values)))
 
     def rms_mm(self, motion_mm: Array) -> float:
-        """Return the error of a motion (2, n)."""
+        """Return the rms contour error of a motion (2, n)."""
         return self._rms(motion_mm[:, self._at])
 
     def _rms(self, points: Array) -> float:

@@ -94,7 +94,12 @@ def read_measurements(
 def read_content(
     content: bytes, name: str, *, settings: ReadSettings | None = None
 ) -> tuple[Measurement, ...]:
-    """Read the content of a file called `name`; see `read_measurements`."""
+    """Read the content of a file called `name`; see `read_measurements`.
+
+    Raises
+    ------
+    ModelError
+    """
     settings = settings or ReadSettings()
     content = unpacked(content, name, LARGEST_BYTES)
     content = as_utf8(content)
