@@ -161,7 +161,7 @@ def _way(
     measurement.finish()
     channels = measurement.channels()
     if has_measured_set(machine):
-        channels = measurement.sample.ranged(channels, machine, design.shaper)
+        channels = measurement.excerpts.ranged(channels, machine, design.shaper)
     return live_way(channels[0], motion.time_s, size)
 
 

@@ -50,7 +50,7 @@ from stillpath.pipeline.options import stamp
 from stillpath.pipeline.order import Order
 from stillpath.pipeline.pacing.budget import SpeedBudget
 from stillpath.pipeline.pacing.budget_measure import BudgetMeasurement
-from stillpath.pipeline.pacing.samples import take_samples
+from stillpath.pipeline.pacing.excerpts import take_excerpts
 from stillpath.pipeline.parts import FileParts
 from stillpath.pipeline.progress import ProgressReports
 from stillpath.pipeline.result import PutBack, Result, StageTime
@@ -255,7 +255,7 @@ class PipelineRun:
     def _chosen_paces(self, size: int) -> SpeedBudget:
         self._source.seek(0)
         with self._clock.stage("budget"):
-            found = take_samples(
+            found = take_excerpts(
                 self._source,
                 self._machine,
                 dialect_for(self._machine, self._options.dialect),

@@ -164,7 +164,7 @@ def simulate_motion(
             writer.finish(motion.feature_names)
     channels = measurement.channels("printed live")
     if live is not None and has_measured_set(machine):
-        channels = measurement.sample.ranged(channels, machine, shaper)
+        channels = measurement.excerpts.ranged(channels, machine, shaper)
     notes = [*operation.notes(), *motion.notes]
     if set(motion.shapers) - {OFF.label}:
         notes.append(f"The file sets the firmware's shaper: {', '.join(motion.shapers)}.")

@@ -20,13 +20,13 @@ from stillpath.models.machine import Machine
 from stillpath.models.schedule import OperatingPoint
 from stillpath.pipeline.band import BandContent
 from stillpath.pipeline.measuring.earlier import EarlierErrors
+from stillpath.pipeline.measuring.excerpts import MotionExcerpts
 from stillpath.pipeline.measuring.layer_views import LayerViews
 from stillpath.pipeline.measuring.layers import LayerRecorder, LayerTile
 from stillpath.pipeline.measuring.maxima import RINGING_S, Maxima
 from stillpath.pipeline.measuring.points import MeasuredPoints, MotionSamples
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.pipeline.measuring.responses import Responses, ResponseSamples
-from stillpath.pipeline.measuring.sample import MotionSample
 from stillpath.pipeline.measuring.spectra import ErrorSpectra
 from stillpath.pipeline.measuring.tracing import Trace, Tracer
 from stillpath.pipeline.result import (
@@ -75,7 +75,7 @@ class Measurement:
 
     Attributes
     ----------
-    sample : MotionSample
+    excerpts : MotionExcerpts
         Some of the motion, for the range of its errors.
     """
 
@@ -116,7 +116,7 @@ class Measurement:
         self._waiting: list[MeasuredPoints] = []
         self._jumped = True
         self._last: MotionSamples | None = None
-        self.sample = MotionSample(dt_s)
+        self.excerpts = MotionExcerpts(dt_s)
 
     def operate_at(self, point: OperatingPoint) -> None:
         """Set the operating point of the motion that follows."""
@@ -126,7 +126,7 @@ class Measurement:
         """Add motion."""
         if len(samples):
             self._last = samples
-            self.sample.add(samples)
+            self.excerpts.add(samples)
             which = slice(-self._count % self._stride, None, self._stride)
             points = MeasuredPoints.of(samples, which, jumped=self._jumped)
             if len(points):
