@@ -27,10 +27,10 @@ from stillpath.gcode.slicers.facts import SlicerFacts
 from stillpath.gcode.types import Phases
 from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine
+from stillpath.pipeline.compensated_piece import CompensatedPiece
 from stillpath.pipeline.files import default_cache_dir
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.order import Order
-from stillpath.pipeline.piece_compensator import CompensatedPiece
 from stillpath.pipeline.pipeline_run import PieceAttempt, PipelineRun
 from stillpath.pipeline.result import Result
 

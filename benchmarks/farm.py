@@ -62,7 +62,7 @@ def here(
     from stillpath.cli.batch.batch import run_batch
     from stillpath.cli.batch.items import Group, items_of
     from stillpath.cli.batch.output import OutputFolder
-    from stillpath.cli.batch.worker_pool import LocalPool, worker_pool
+    from stillpath.cli.batch.worker_pool import LocalBackend, worker_pool
     from stillpath.cli.own_machines import open_machines
     from stillpath.pipeline.options import Options
 
@@ -71,7 +71,7 @@ def here(
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     began, busy_s = time.monotonic(), []
     with OutputFolder.opened(output) as kept:
-        works = LocalPool(open_machines(), options, workers)
+        works = LocalBackend(open_machines(), options, workers)
         with worker_pool(works, kept, options, workers) as made:
             outcomes = run_batch(made, kept, items, tell=lambda o: busy_s.append(o.took_s))
             wall_s = time.monotonic() - began

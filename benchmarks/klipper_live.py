@@ -23,12 +23,13 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from stillpath.applications.live.export import write_export
+from stillpath.compensation.defaults import DT_S
 from stillpath.models.machine import Machine
 from stillpath.models.plants import plant_set
 from stillpath.models.store import load_machine
 from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.file_motion import FileMotion
-from stillpath.pipeline.live_design import DT_S, live_filter
+from stillpath.pipeline.live_design import live_filter
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.result import Result
 from stillpath.pipeline.simulate import simulate_motion

@@ -66,7 +66,8 @@ def restore(
 
 def migrate(data_dir: DataDir = None) -> None:
     """Bring the database to the schema of this version; `serve` does so at its start, too."""
-    from stillpath.service.database.engine import StoreError, open_database
+    from stillpath.service.database.engine import open_database
+    from stillpath.service.database.errors import StoreError
     from stillpath.service.database.migrations import LATEST
 
     try:

@@ -137,7 +137,8 @@ def audit(
 
 @contextmanager
 def _opened(data_dir: Path | None, *, may_be_new: bool = False) -> Iterator[Engine]:
-    from stillpath.service.database.engine import SQLITE_FILE, StoreError, open_database
+    from stillpath.service.database.engine import SQLITE_FILE, open_database
+    from stillpath.service.database.errors import StoreError
     from stillpath.service.security.keys import KeyRefused
 
     settings = service_settings(data_dir=data_dir)

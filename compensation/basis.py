@@ -177,6 +177,11 @@ def robust_functions(gram: Array, mean: Array, r: int | None = None) -> tuple[Ar
     mu : ndarray, shape (m - r,)
         Eigenvalues, falling. n functions reach J_e,r^2 = 1 - sum(mu_1 .. mu_n) / rows, and
         sqrt(1 - mu_i) are the singular values of Delta_nom,s for the nominal model (4.28).
+
+    Raises
+    ------
+    DesignError
+        If `r` leaves nothing, or directions that the plants hardly respond to.
     """
     m = len(gram)
     squared, w = np.linalg.eigh(gram)
@@ -208,6 +213,11 @@ def robust_basis_for(nominal: Array, spread_gram: Array, n: int, r: int = 0) -> 
     -------
     ndarray, shape (m, n)
         Psi_nom: G_nom Psi_nom has orthonormal columns; the most robust functions first.
+
+    Raises
+    ------
+    DesignError
+        If there are not `n` such functions.
     """
     functions, _ = spread_functions(nominal, spread_gram, r)
     m, most = functions.shape

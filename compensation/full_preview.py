@@ -218,7 +218,13 @@ class FullPreview:
         return shares[:, np.asarray(counts) - 1]
 
     def initial_state(self, y_d: ArrayLike) -> Array:
-        """Return X gamma, the required initial state of the plant if filters had states."""
+        """Return X gamma, the required initial state of the plant if filters had states.
+
+        Raises
+        ------
+        DesignError
+            If they had none.
+        """
         if self._states is None:
             raise DesignError("this design was made without filter initial states")
         return np.asarray(self._states @ self.coefficients(y_d), np.float64)

@@ -37,6 +37,11 @@ def zero_phase_fir(
     A sampled first-order response delta_n = exp(-2 pi f n dt), n = 0..l, convolved with its own
     mirror image (paper 002); `length` is l, by default where delta has fallen to 2 %. With
     several `passes` it falls off that many times as steeply (and is as many times longer).
+
+    Raises
+    ------
+    DesignError
+        If the cutoff is not below the Nyquist frequency.
     """
     if not 0 < cutoff_hz < 0.5 / dt_s:
         raise DesignError(f"FIR cutoff {cutoff_hz} Hz must lie between 0 and {0.5 / dt_s:g} Hz")

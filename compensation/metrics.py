@@ -36,7 +36,12 @@ def error_metric(plant: LiftedOperator, controller: Array) -> float:
 
 
 def error_of_functions(n: int, samples: int) -> float:
-    """Return J_e = sqrt(1 - n / samples) of n independent filtered functions (2.26)."""
+    """Return J_e = sqrt(1 - n / samples) of n independent filtered functions (2.26).
+
+    Raises
+    ------
+    DesignError
+    """
     if not 0 <= n <= samples:
         raise DesignError(f"{n} functions for {samples} samples: take 0 to {samples}")
     return float(np.sqrt(1.0 - n / samples))
@@ -102,6 +107,10 @@ def robust_error_of_spread(singular_values: ArrayLike, n: int, samples: int) -> 
     ----------
     singular_values : array_like
         Of Delta_nom,s, in any order.
+
+    Raises
+    ------
+    DesignError
     """
     sigma = np.sort(np.asarray(singular_values, np.float64))
     if not 0 <= n <= len(sigma):
@@ -126,6 +135,10 @@ def toeplitz_metric(coefficients: ArrayLike, samples: int) -> float:
     ----------
     coefficients : array_like, shape (2 k + 1,)
         e_-k .. e_k, with k < samples.
+
+    Raises
+    ------
+    DesignError
     """
     e = np.asarray(coefficients, np.float64)
     lags = np.abs(np.arange(len(e)) - len(e) // 2)

@@ -72,7 +72,13 @@ def lifted_optimum(members: LiftedSet) -> Array:
 
 
 def spread_gram(members: LiftedSet, nominal: Array) -> Array:
-    """Return Delta'Delta = sum_j l_j (G_j - G_nom)'(G_j - G_nom) of (4.14), shape (cols, cols)."""
+    """Return Delta'Delta = sum_j l_j (G_j - G_nom)'(G_j - G_nom) of (4.14), shape (cols, cols).
+
+    Raises
+    ------
+    DesignError
+        If the shapes do not fit.
+    """
     if nominal.shape != members.mean.shape:
         raise DesignError(
             f"nominal model of shape {nominal.shape} for plants of shape {members.mean.shape}"

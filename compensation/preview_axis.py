@@ -168,7 +168,7 @@ class PreviewAxis:
         self.rung = self._next_rung
         self._cached = None
 
-    def answer(self, member: int, command: Array) -> Array:
+    def response(self, member: int, command: Array) -> Array:
         """Return the response (n,) of a member of the set to a command (n,)."""
         first = sum(p.order for p in self._plants[:member])
         respond = self._responses[member]

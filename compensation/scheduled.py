@@ -17,17 +17,13 @@ from numpy.typing import NDArray
 from stillpath.compensation.base import Compensator, DesignError
 from stillpath.models.arrays import Array
 from stillpath.models.machine import Machine
-from stillpath.models.operating import OperatingGrid, machine_at
+from stillpath.models.operating import BLEND_STEP, REMEMBERED_S, OperatingGrid, machine_at
 from stillpath.models.schedule import EMPTY, OperatingPoint
 
-__all__ = ["BLEND_STEP", "DESIGN_STEP", "REMEMBERED_S", "ScheduledCompensator"]
+__all__ = ["DESIGN_STEP", "ScheduledCompensator"]
 
 DESIGN_STEP = 0.02
 """Relative change of a resonance between neighbouring designs in mass and height."""
-BLEND_STEP = 0.02
-"""The same in x and y, where blending leaves an error of the square of the difference."""
-REMEMBERED_S = 4.0
-"""Length of the past motion replayed by a compensator before it takes over."""
 _ROOM = 0.98
 """Share of the limits for each design, as a blend slightly exceeds those of its parts."""
 

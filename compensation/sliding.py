@@ -76,9 +76,9 @@ def slide(
     for _ in range(ROUNDS):
         positions = [command.position_mm for command in commands]
         for j in range(members):
-            answer = member_response(axes, positions, j)
+            response = member_response(axes, positions, j)
             move_targets(
-                path, answer, extruding, along, WEIGHT_TRAVEL, reach, RELAXATION, targets[j]
+                path, response, extruding, along, WEIGHT_TRAVEL, reach, RELAXATION, targets[j]
             )
         moved = []
         for i, (axis, task) in enumerate(zip(axes, tasks, strict=True)):
@@ -152,9 +152,9 @@ def balanced_weights(
         if along < 1.0:
             commands = slide(axes, commands, tasks, chosen, extruding, along, dt_s)
         positions = [command.position_mm for command in commands]
-        answers = (member_response(axes, positions, j) for j in range(axes[0].members))
+        responses = (member_response(axes, positions, j) for j in range(axes[0].members))
         reach = 2 * _reach(dt_s)
-        squares = np.array([contour_square(path, y, extruding, reach, 3) for y in answers])
+        squares = np.array([contour_square(path, y, extruding, reach, 3) for y in responses])
         for i, prior in enumerate(given):
             wanted = prior * squares
             # Geometric mean of old and new weights, as the errors depend on the weights.
@@ -169,7 +169,7 @@ def member_response(
 ) -> Array:
     """Return the response of member j of X and of Y, shape (2, n); the shorter set repeats."""
     pairs = zip(axes, commands_mm, strict=True)
-    return np.stack([axis.answer(j % axis.members, u) for axis, u in pairs])
+    return np.stack([axis.response(j % axis.members, u) for axis, u in pairs])
 
 
 def _reach(dt_s: float) -> int:

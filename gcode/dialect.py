@@ -175,7 +175,7 @@ class Dialect:
         return self.otherwise(name) if found is None else found
 
     def table(self, letter: str) -> NDArray[np.int8]:
-        """Return the class of letter + 0 to 1023: an `EventKind`, an `Action` or -1 (Python).
+        """Return what letter + 0 to 1023 are: an `EventKind`, an `Action` or -1 (Python), (1024,).
 
         Made once; only to be read.
         """

@@ -34,9 +34,9 @@ class VerbatimPart(TextLines):
     Attributes
     ----------
     moves, events : Moves, Events
-        `Events.move_index` counts within this item.
+        `Events.move_index` counts within this part.
     text : bytes
-        The item's own bytes.
+        The part's own bytes.
     text_offset : int
         Where they start in the file; `byte_start` and `byte_end` columns are absolute.
     limits, modal : lists
@@ -85,7 +85,7 @@ class Piece(VerbatimPart):
 
     @property
     def marked_rows(self) -> NDArray[np.int64]:
-        """Rows of moves before which a fan, an output or a message is switched, in motion."""
+        """Rows (k,) of moves before which a fan, an output or a message is switched, in motion."""
         events = self.events
         inside = (events.kind == EventKind.HARMLESS) & (events.move_index < len(self.moves))
         begins = events.byte_start[inside] - self.text_offset

@@ -7,7 +7,7 @@ kernel does not know are functions of this state, one module of them per firmwar
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,7 +18,6 @@ from stillpath.gcode._motion_kernels import travel
 from stillpath.gcode._table_kernels import (
     Rows,
     Tables,
-    intern_row,
     line_hash,
     memo_slot,
     note_limits,
@@ -30,19 +29,15 @@ from stillpath.gcode._table_kernels import (
 from stillpath.gcode.dialect import Dialect, OriginRule
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.lexer import Command, extended_parameters
+from stillpath.gcode.tables import MOST_MEMOS, are_large, begun_anew, grown, new_tables
 from stillpath.gcode.types import KEPT, OF_STATE, EventKind, Limits
 from stillpath.models.firmware import FirmwareFacts, FirmwareRetraction, Marlin, RepRapFirmware
 from stillpath.models.machine import Machine
 
-__all__ = ["EXTRUDER_MODE", "MachineState", "Names", "Retraction", "Saved", "nobody"]
+__all__ = ["EXTRUDER_MODE", "MachineState", "Names", "Retraction", "Saved"]
 
 EXTRUDER_MODE = "extruder mode"
 """Why moves are held that feed filament before the file says M82 or M83."""
-_MEMOS = 8192
-_FIRST_ROWS = 256
-_MOST_ROWS = 4096
-"""Size of a table above which it is cleared as soon as its rows are no longer needed."""
-_LAYERS = 1024
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,13 +74,37 @@ class MachineState:
 
     Attributes
     ----------
-    f, i : ndarray
-        Numbers; slots in `gcode._slots`.
+    f, i, w : ndarray
+        Numbers, with slots in `gcode._slots`; the words of the command in hand, A to Z.
+    rows, tables : Rows, Tables
+        The block that is being written, and what its rows refer to.
     buffer, span : ndarray, (int, int)
         The text that is being read, and where the line in hand begins (after blanks and its
         number) and ends in it.
-    carry_out : function
-        Carries out another command of the same line (the interpreter's).
+    limits_type, limits_names : type, tuple of str
+        The firmware's `Limits`, and its fields in the order of a row.
+    initial_limits : tuple of float
+        The row that is in force before the first line.
+    features, objects : Names
+        Names behind the `feature` and `object_id` columns.
+    saved : dict of str to Saved
+        States and places by the command and number, or the name, that they were saved with.
+    workspaces, workspace : dict of int to origin, int
+        Origins of G54 (0) to G59.3 (8), and which one is in use; -1: the machine's own.
+    retraction : Retraction, optional
+        What G10 and G11 do; None: the machine states none.
+    retracted, retracted_at : dict of int
+        Whether each tool is retracted, and I_MACROS when that was known; Klipper has one for all.
+    hop_mm : float
+        How much G10 has lifted Z.
+    settings : dict of str to float
+        What commands have set that has no slot and is no limit, by names of their handlers.
+    tool_known : bool
+        Whether it is known which tool is in use.
+    conditional_indent : int
+        Indentation of the ``if`` or ``while`` whose block is being read; -1: none.
+    layer_style : str, optional
+        Beginning of the first layer mark; others do not count layers.
     held : dict of str to bool
         Why moves stay as they are (`hold`).
     laser_mode : bool
@@ -96,6 +115,8 @@ class MachineState:
         The file has called what may be a macro of the printer; it has set an acceleration.
     first_macro : tuple of str and int, optional
         The first one of an unknown name, and its line.
+    remembers : bool
+        The line in hand is one command (`remember`).
     warnings : dict of str to int
         What the firmware skips or what is unknown, with the line of first occurrence.
     notes : dict of str to int
@@ -119,9 +140,8 @@ class MachineState:
         self.retraction = None if facts is None else Retraction.of(facts)
         self.retracted: dict[int, bool] = {}
         self.retracted_at: dict[int, int] = {}
-        """By tool, and I_MACROS when that was known; Klipper has one state for all."""
         self.hop_mm = 0.0
-        self.factors: dict[str, float] = {}
+        self.settings: dict[str, float] = {}
         self.macro_ran = self.states_acceleration = False
         self.first_macro: tuple[str, int] | None = None
         self.held: dict[str, bool] = {}
@@ -131,12 +151,10 @@ class MachineState:
         self.warnings: dict[str, int] = {}
         self.notes: dict[str, int] = {}
         self.layer_style: str | None = None
-        self.carry_out: Callable[[Command], int] = nobody
         self.buffer = np.zeros(0, np.uint8)
         self.span = (0, 0)
         self.remembers = True
-        """The line in hand is one command (`remember`)."""
-        self.memos = self.memo_limits = 0
+        self._memos = self._memo_limits = 0
 
         self.f = f = np.zeros(at.F_SIZE)
         self.i = i = np.zeros(at.I_SIZE, np.int64)
@@ -145,7 +163,7 @@ class MachineState:
         if len(row) > at.MAX_LIMITS:
             raise ValueError(f"{len(row)} limits, more than {at.MAX_LIMITS}")
         self.rows = Rows.empty(0)
-        self.tables = _new_tables(len(row), dialect)
+        self.tables = new_tables(len(row), dialect)
         f[at.F_SPEED] = dialect.start_speed_mm_s
         f[at.F_SPEED_FACTOR] = 1.0 / 60.0
         f[at.F_EXTRUDE_FACTOR] = f[at.F_UNIT_MM] = f[at.F_UNIT_E_MM] = 1.0
@@ -283,10 +301,10 @@ class MachineState:
             row[self.limits_names.index(name)] = value
         limits = self.f[at.F_LIMITS : at.F_LIMITS + len(row)]
         remember = remember and kind == EventKind.LIMITS and self.f[at.F_UNIT_MM] == 1.0
-        if remember and self.memo_limits < len(self.tables.memo_limits):
-            self.tables.memo_limits[self.memo_limits] = row
-            if self.remember(command, at.MEMO_LIMITS, self.memo_limits):
-                self.memo_limits += 1
+        if remember and self._memo_limits < len(self.tables.memo_limits):
+            self.tables.memo_limits[self._memo_limits] = row
+            if self.remember(command, at.MEMO_LIMITS, self._memo_limits):
+                self._memo_limits += 1
         limits[:] = np.where(np.isnan(row), limits, row)
         note_limits(self.f, self.i, self.rows, self.tables)
         return self.event(kind)
@@ -301,7 +319,7 @@ class MachineState:
     def remember(self, command: Command, what: int, value: int) -> bool:
         """Let the kernel repeat this effect whenever the line recurs."""
         known_whole = self.remembers and self.conditional_indent < 0 and not command.dropped
-        if self.memos >= _MEMOS // 2 or not known_whole:
+        if self._memos >= MOST_MEMOS or not known_whole:
             return False
         key = line_hash(self.buffer, *self.span)
         slot = memo_slot(self.tables.memo_keys, key)
@@ -309,7 +327,7 @@ class MachineState:
             return False
         self.tables.memo_keys[slot] = key
         self.tables.memo_values[slot] = what * at.MEMO_STRIDE + value
-        self.memos += 1
+        self._memos += 1
         return True
 
     # Reading values
@@ -353,7 +371,13 @@ class MachineState:
         return found
 
     def at_least(self, value: str, key: str, low: float, command: Command) -> float:
-        """Read a number that must not be below `low`."""
+        """Read a number that must not be below `low`.
+
+        Raises
+        ------
+        GcodeError
+            It is none, or below.
+        """
         number = self.number(value, key, command)
         if number < low:
             raise self.problem(f"{key}={value} must be at least {low:g}", command)
@@ -392,34 +416,16 @@ class MachineState:
 
     def grow_tables(self) -> None:
         """Make the tables larger that are full."""
-        i, tables = self.i, self.tables
-        if i[at.I_N_MODAL] + 2 > len(tables.modal):
-            rows, index = _grown(tables.modal, int(i[at.I_N_MODAL]))
-            tables = tables._replace(modal=rows, modal_index=index)
-        if i[at.I_N_LIMITS] + 2 > len(tables.limits):
-            rows, index = _grown(tables.limits, int(i[at.I_N_LIMITS]))
-            tables = tables._replace(limits=rows, limits_index=index)
-        if i[at.I_LAYER] + 2 > len(tables.layer_z):
-            more = np.full(len(tables.layer_z), np.nan)
-            tables = tables._replace(layer_z=np.concatenate([tables.layer_z, more]))
-        self.tables = tables
+        self.tables = grown(self.tables, self.i)
 
     def forget_rows(self) -> bool:
         """Begin new tables of modes and limits if these are large; rows 0 are those in force.
 
         All that was written must have been handed over. Return whether it was so.
         """
-        i, tables = self.i, self.tables
-        if max(i[at.I_N_MODAL], i[at.I_N_LIMITS]) <= _MOST_ROWS:
+        if not are_large(self.i):
             return False
-        modal, modal_index = _begun(tables.modal[i[at.I_MODAL_ID]])
-        limits, limits_index = _begun(tables.limits[i[at.I_LIMITS_ID]])
-        i[at.I_N_MODAL] = i[at.I_N_LIMITS] = 1
-        i[at.I_MODAL_ID] = i[at.I_LIMITS_ID] = 0
-        tables.memo_after[:] = -1
-        self.tables = tables._replace(
-            modal=modal, modal_index=modal_index, limits=limits, limits_index=limits_index
-        )
+        self.tables = begun_anew(self.tables, self.i)
         return True
 
 
@@ -444,11 +450,6 @@ class Names:
         return other
 
 
-def nobody(command: Command) -> int:
-    """Carry out commands while nothing is read: there are none."""
-    raise RuntimeError(f"no handler for {command.name}")
-
-
 def _set_arcs(f: NDArray[np.float64], firmware: FirmwareFacts) -> None:
     """Set how finely the firmware cuts arcs."""
     f[at.F_ARC_MM] = firmware.arc_resolution_mm
@@ -462,36 +463,3 @@ def _set_arcs(f: NDArray[np.float64], firmware: FirmwareFacts) -> None:
         f[at.F_ARC_LEAST_MM] = firmware.arc_least_mm
         f[at.F_ARC_PER_S] = firmware.arc_segments_per_s
         f[at.F_ARC_DEVIATION_MM] = firmware.arc_deviation_mm
-
-
-def _new_tables(limits: int, dialect: Dialect) -> Tables:
-    return Tables(
-        *_new_table(limits, _FIRST_ROWS),
-        *_new_table(at.MODAL_SIZE, _FIRST_ROWS),
-        np.zeros(_MEMOS, np.int64),
-        np.zeros(_MEMOS, np.int64),
-        np.full((_MEMOS // 2, limits), np.nan),
-        np.full((_MEMOS // 2, 2), -1, np.int32),
-        dialect.table("G"),
-        dialect.table("M"),
-        np.full(_LAYERS, np.nan),
-    )
-
-
-def _new_table(columns: int, rows: int) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    return np.zeros((rows, columns)), np.full(4 * rows, -1, np.int32)
-
-
-def _begun(row: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    rows, index = _new_table(len(row), _FIRST_ROWS)
-    rows[0] = row
-    intern_row(rows, index, 0)
-    return rows, index
-
-
-def _grown(rows: NDArray[np.float64], count: int) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    larger, index = _new_table(rows.shape[1], 2 * len(rows))
-    for number in range(count):
-        larger[number] = rows[number]
-        intern_row(larger, index, number)
-    return larger, index

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from stillpath.gcode import _slots as at
+from stillpath.gcode.handback import carry_out
 from stillpath.gcode.lexer import Command, split_line
 from stillpath.gcode.state import MachineState, Saved
 from stillpath.gcode.types import KEPT, EventKind
@@ -59,7 +60,7 @@ def machine_space(state: MachineState, command: Command) -> int:
     moves = int(state.i[at.I_MOVES])
     # In Marlin, what G92 has shifted in native space stays.
     _set_shift(state, _NONE if before != native else shift)
-    status = state.carry_out(rest[0])
+    status = carry_out(state, rest[0])
     _set_shift(state, shift)
     # The line does more than move, and must stay.
     state.settle()

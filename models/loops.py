@@ -103,6 +103,11 @@ class Loop:
         """Make the loop P = N/(M - N) with C = 1 of a complementary sensitivity N/M.
 
         A dc gain above 1 is scaled to 1: it would put the integrator of P outside the circle.
+
+        Raises
+        ------
+        ModelError
+            If N/M has no finite gain at standstill.
         """
         top, bottom = _aligned(num, den)
         if not (np.all(np.isfinite(top)) and np.all(np.isfinite(bottom)) and bottom.sum()):

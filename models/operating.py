@@ -24,7 +24,13 @@ from stillpath.models.schedule import (
     resonances_hz,
 )
 
-__all__ = ["OperatingGrid", "machine_at", "mass_schedules"]
+__all__ = ["BLEND_STEP", "REMEMBERED_S", "OperatingGrid", "machine_at", "mass_schedules"]
+
+BLEND_STEP = 0.02
+"""Relative change of a resonance between neighbouring nodes in x and y, which are blended: that
+leaves an error of the square of the difference."""
+REMEMBERED_S = 4.0
+"""How much of the past is shown to plants that take over: older vibration has died down."""
 
 
 def machine_at(machine: Machine, point: OperatingPoint) -> Machine:

@@ -121,7 +121,7 @@ class ContinuousPlant(_StateSpace):
         return self._at(2j * np.pi * np.atleast_1d(np.asarray(f_hz, float)))
 
     def modes(self) -> Array:
-        """Return rows (f_hz, zeta) of the resonances, rising in frequency."""
+        """Return rows (f_hz, zeta) of the resonances, rising in frequency, shape (modes, 2)."""
         return frequency_and_damping(self.poles(), None)
 
     def settling_time_s(self, tolerance: float = 0.01) -> float:
@@ -161,7 +161,7 @@ class DiscretePlant(_StateSpace):
         return self._at(np.exp(2j * np.pi * f * self.dt_s))
 
     def modes(self) -> Array:
-        """Return rows (f_hz, zeta) of the resonances, rising in frequency."""
+        """Return rows (f_hz, zeta) of the resonances, rising in frequency, shape (modes, 2)."""
         return frequency_and_damping(self.poles(), self.dt_s)
 
     def settling_time_s(self, tolerance: float = 0.01) -> float:
@@ -176,7 +176,7 @@ class DiscretePlant(_StateSpace):
         return float(max(slowest, self.order) * self.dt_s)
 
     def impulse_response(self, samples: int) -> Array:
-        """Return the first `samples` Markov parameters d, cb, cab, ..."""
+        """Return the first `samples` Markov parameters d, cb, cab, ..., shape (samples,)."""
         out = np.empty(samples)
         x = self.b.copy()
         for k in range(samples):
@@ -186,7 +186,7 @@ class DiscretePlant(_StateSpace):
         return out
 
     def rest_state(self, u: float = 1.0) -> Array:
-        """Return the state in which the plant stands still at the constant command `u`."""
+        """Return the state (order,) in which the plant stands still at the constant command `u`."""
         return np.asarray(np.linalg.solve(np.eye(self.order) - self.a, self.b) * u, np.float64)
 
 

@@ -42,7 +42,13 @@ class Roots:
 def dc_gain(
     zeros: NDArray[np.complex128], poles: NDArray[np.complex128], dt_s: float | None
 ) -> float:
-    """Return prod(v0 - zeros) / prod(v0 - poles), with v0 = 0 in s (no `dt_s`) and 1 in z."""
+    """Return prod(v0 - zeros) / prod(v0 - poles), with v0 = 0 in s (no `dt_s`) and 1 in z.
+
+    Raises
+    ------
+    ModelError
+        For an integrator.
+    """
     at = 0.0 if dt_s is None else 1.0
     if np.any(poles == at):
         raise ModelError(
@@ -117,7 +123,7 @@ def normalise_dc(roots: Roots) -> tuple[Roots, tuple[str, ...]]:
 def to_s(
     roots: NDArray[np.complex128], dt_s: float | None
 ) -> tuple[NDArray[np.complex128], NDArray[np.bool_]]:
-    """Map roots to s = log(z) / dt_s; the mask tells which have such an image.
+    """Map roots (n,) to s = log(z) / dt_s; the mask (n,) tells which have such an image.
 
     Zero and the negative real axis of z have none (above or at the Nyquist frequency).
     """

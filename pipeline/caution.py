@@ -218,17 +218,25 @@ class Mixtures:
         axes = [machine.axes[axis].without_delay() for axis in ("x", "y")]
         self._pairs = side_by_side(*(plant_set(axis, dt_s).members for axis in axes))
         self._weights = _pair_weights(machine, len(self._pairs))
-        self._smooth = self.answers(smooth_mm)
+        self._smooth = self.responses(smooth_mm)
         self.shaped_mm = np.maximum(self.errors_mm(self._smooth), 1e-12)
 
-    def answers(self, command_mm: Array) -> list[Array]:
-        """Return the motion of every pair at the measured points."""
+    def responses(self, command_mm: Array) -> list[Array]:
+        """Return the motion of every pair at the measured points, shape (2, points) each."""
         return [response(pair, command_mm)[:, self._at] for pair in self._pairs]
 
-    def errors_mm(self, answers: Sequence[Array], shares: Shares = (1.0, 1.0)) -> Array:
-        """Return the rms error of every pair with a command, or with a mixture of it."""
+    def errors_mm(self, responses: Sequence[Array], shares: Shares = (1.0, 1.0)) -> Array:
+        """Return the rms contour errors [mm] with a command, or a mixture of it, shape (pairs,).
+
+        Parameters
+        ----------
+        responses : sequence of ndarray
+            To the command.
+        shares : (float, float)
+            Of the command on X and on Y; the rest is the shaper's.
+        """
         a = np.array(shares)[:, None]
-        both = zip(answers, self._smooth, strict=True)
+        both = zip(responses, self._smooth, strict=True)
         return np.array([self._rms(a * exact + (1.0 - a) * smooth) for exact, smooth in both])
 
     def mean(self, values: Array) -> float:
@@ -236,7 +244,7 @@ class Mixtures:
         return float(np.exp(self._weights @ np.log(values)))
 
     def rms_mm(self, motion_mm: Array) -> float:
-        """Return the error of a motion (2, n)."""
+        """Return the rms contour error of a motion (2, n)."""
         return self._rms(motion_mm[:, self._at])
 
     def _rms(self, points: Array) -> float:
@@ -260,8 +268,8 @@ def _chosen_by_trial(
     most_shares = [most_share(machine.axes[axis]) for axis in ("x", "y")]
     exact, smooth = _commands(machine, shaper, basis, dt_s, mode if any(most_shares) else None)
     mixtures = Mixtures(machine, path, extruding, smooth, dt_s)
-    exact_mm = mixtures.answers(exact)
-    none_mm = np.maximum(mixtures.errors_mm(mixtures.answers(path)), 1e-12)
+    exact_mm = mixtures.responses(exact)
+    none_mm = np.maximum(mixtures.errors_mm(mixtures.responses(path)), 1e-12)
 
     @cache
     def choice(shares: Shares) -> Mixture:

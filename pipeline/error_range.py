@@ -151,15 +151,15 @@ def error_ranges(
             step_s = dt_s if creeps else 0.0
             return [DryFriction(held_mm.tolist(), step_s).received_mm(one) for one in stretches]
 
-        def answered(pair: Pair, received: Sequence[Array], lag: float = 0.0) -> float:
+        def error_mm(pair: Pair, received: Sequence[Array], lag: float = 0.0) -> float:
             return rms([_delayed(response(pair, one), lag) for one in received])
 
         def rubbed(held_mm: Array, *, creeps: bool = True) -> float:
-            return answered((x.nominal, y.nominal), received_mm(held_mm, creeps=creeps))
+            return error_mm((x.nominal, y.nominal), received_mm(held_mm, creeps=creeps))
 
         received = received_mm(known_mm)
-        error = max(answered((x.nominal, y.nominal), received), 1e-12)
-        errors = [answered(pair, received, lag) for pair, lag in zip(pairs, lags, strict=True)]
+        error = max(error_mm((x.nominal, y.nominal), received), 1e-12)
+        errors = [error_mm(pair, received, lag) for pair, lag in zip(pairs, lags, strict=True)]
         less, more = rubbed(known_mm - unsure_mm), rubbed(more_mm)
         bent = rubbed(known_mm, creeps=False)
         return ErrorRange(

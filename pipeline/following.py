@@ -41,7 +41,7 @@ def strayed(
     Parameters
     ----------
     gap_mm : ndarray, shape (n,)
-        From `pipeline.piece_compensator.deviation`.
+        From `pipeline.compensated_piece.deviation`.
     extruding : ndarray of bool, shape (n,)
     tolerance_mm : float
         From `follow_tolerance_mm`.

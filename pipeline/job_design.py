@@ -7,12 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from stillpath.compensation.cautious import Caution
+from stillpath.compensation.defaults import DT_S
 from stillpath.models.machine import Machine
 from stillpath.pipeline.caution import Mixture, caution_for
 from stillpath.pipeline.clock import StageClock
 from stillpath.pipeline.measuring.reference_shaper import BestShaper, cached_shaper
 from stillpath.pipeline.options import Options
-from stillpath.pipeline.piece_compensator import DT_S, PieceCompensator
+from stillpath.pipeline.piece_compensator import PieceCompensator
 
 __all__ = ["JobDesign", "design_job"]
 

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from stillpath.compensation.base import DesignError
+from stillpath.compensation.defaults import DT_S
 from stillpath.compensation.live_filter import LiveFilter, design_taps, exact_moments, shaper_taps
 from stillpath.models.arrays import Array
 from stillpath.models.machine import Machine, MotorLimits
@@ -35,7 +36,6 @@ from stillpath.pipeline.measuring.reference_shaper import BestShaper, cached_sha
 
 __all__ = ["LiveDesign", "cached_live_design", "design_live", "live_filter"]
 
-DT_S = 1e-3
 _VERSION = 8
 """Part of the cache's name; rises when the design changes."""
 _CORNERS_HZ = (70.0, 90.0, 115.0, 150.0, 200.0, 270.0)
@@ -172,7 +172,7 @@ class _Trial:
         best = min(accurate, key=lambda one: (one.corner_hz, one.ratio))
         command = self._command(best.taps)
         mixtures = self._mixtures
-        ratio = mixtures.errors_mm(mixtures.answers(command)) / mixtures.shaped_mm
+        ratio = mixtures.errors_mm(mixtures.responses(command)) / mixtures.shaped_mm
         channels = {"before": [self._path], "live": [command], "shaper": [self._smooth]}
         return LiveDesign(
             best.taps,
@@ -195,7 +195,7 @@ class _Trial:
             command = self._command(exact)
             if _peak(command) > self._machine.command.accel_mm_s2:
                 continue
-            cost = cache(partial(self._ratio, self._mixtures.answers(command)))
+            cost = cache(partial(self._ratio, self._mixtures.responses(command)))
             shares = best_shares(cost, most_shares)
             if shares != (0.0, 0.0) and np.isfinite(cost(shares)):
                 yield _Candidate(cost(shares), corner_hz, self._mixed(exact, shares), shares)

@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from stillpath.compensation.base import DesignError
+from stillpath.compensation.defaults import DT_S
 from stillpath.gcode.errors import GcodeError
 from stillpath.models.machine import Machine
 from stillpath.pipeline.caution import has_measured_set
@@ -23,7 +24,6 @@ from stillpath.pipeline.measuring.tracing import Trace
 from stillpath.pipeline.operating_point import Operation
 from stillpath.pipeline.options import DialectName, Options
 from stillpath.pipeline.parts import refuse_processed
-from stillpath.pipeline.piece_compensator import DT_S
 from stillpath.pipeline.progress import Progress, ProgressCallback
 from stillpath.pipeline.result import PrintWay, Result, StageTime
 from stillpath.pipeline.simulate import measured, simulate_motion
@@ -161,7 +161,7 @@ def _way(
     measurement.finish()
     channels = measurement.channels()
     if has_measured_set(machine):
-        channels = measurement.sample.ranged(channels, machine, design.shaper)
+        channels = measurement.excerpts.ranged(channels, machine, design.shaper)
     return live_way(channels[0], motion.time_s, size)
 
 

@@ -8,14 +8,15 @@ from typing import NamedTuple
 import numpy as np
 
 from stillpath.compensation.base import Compensator
+from stillpath.compensation.defaults import DT_S
 from stillpath.gcode.firmware.planning import intended
 from stillpath.gcode.pieces import Piece, VerbatimPart
 from stillpath.gcode.sampler import sample_phases, sample_until
 from stillpath.gcode.types import Phases
+from stillpath.pipeline.compensated_piece import CompensatedPiece, as_executed
 from stillpath.pipeline.file_motion import STANDING_S
 from stillpath.pipeline.measuring.measure import Measurement
 from stillpath.pipeline.measuring.points import MotionSamples
-from stillpath.pipeline.piece_compensator import DT_S, CompensatedPiece, as_executed
 from stillpath.pipeline.totals import Totals
 from stillpath.pipeline.verifying import Verifier
 

@@ -8,9 +8,9 @@ import numpy as np
 
 from stillpath.gcode.types import Moves
 from stillpath.models.machine import Machine
-from stillpath.models.operating import OperatingGrid, machine_at, mass_schedules
+from stillpath.models.operating import BLEND_STEP, OperatingGrid, machine_at, mass_schedules
 from stillpath.models.schedule import EMPTY, MassSchedule, OperatingPoint, resonances_hz
-from stillpath.simulation.machine_response import BLEND_STEP, SIMULATION_STEP
+from stillpath.simulation.machine_response import SIMULATION_STEP
 
 __all__ = ["Operation"]
 

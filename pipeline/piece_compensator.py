@@ -3,48 +3,38 @@
 from __future__ import annotations
 
 import contextlib
-from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillpath.compensation.base import Compensator, DesignError
 from stillpath.compensation.cautious import Caution
+from stillpath.compensation.defaults import DT_S
 from stillpath.compensation.registry import compensator
-from stillpath.compensation.scheduled import BLEND_STEP, DESIGN_STEP
-from stillpath.compensation.window_problem import TRAVEL_SLACK_MM
+from stillpath.compensation.scheduled import DESIGN_STEP
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.encoding import Encoded
 from stillpath.gcode.firmware.planning import intended
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.pieces import Piece
-from stillpath.gcode.sampler import distances, sample_phases, sample_until
 from stillpath.gcode.segments import ErrorFilter, Segments, fit_segments
 from stillpath.gcode.timeline import Group, Timeline, build_timeline, group_rows
 from stillpath.gcode.types import Phases
 from stillpath.models.machine import Machine
-from stillpath.models.operating import OperatingGrid, machine_at
+from stillpath.models.operating import BLEND_STEP, OperatingGrid, machine_at
 from stillpath.models.plants import plant_set
 from stillpath.models.schedule import EMPTY, OperatingPoint
 from stillpath.pipeline.caution import design_mode, set_or_nominal
+from stillpath.pipeline.compensated_piece import CompensatedPiece, Unfit, deviation
 from stillpath.pipeline.filament import feed_evenly, retract_along
 from stillpath.pipeline.following import follow_tolerance_mm, strayed
-from stillpath.pipeline.measuring._peak_kernels import peaks, speed_steps
+from stillpath.pipeline.measuring._peak_kernels import peaks
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
+from stillpath.pipeline.motion_limits import MotionLimits, TooAbrupt
 from stillpath.pipeline.options import COARSE_UM, Options
 from stillpath.pipeline.standing import Standing
 
-__all__ = [
-    "DT_S",
-    "CompensatedPiece",
-    "PieceCompensator",
-    "Unfit",
-    "as_executed",
-    "deviation",
-]
-
-DT_S = 1e-3
-"""Sampling time of paths and commands: finer changes contour errors by hundredths of a um."""
+__all__ = ["PieceCompensator"]
 
 _REST_TOLERANCE_S = 5e-3
 _ROUNDS = 2
@@ -56,45 +46,6 @@ _ACCEL_SHARES = (1.0, 0.8, 0.6, 0.5)
 """Shares of the largest acceleration, tried in turn where a motor's speed step is too large."""
 _ROUNDING_S = (2e-3, 4e-3, 8e-3)
 """Half-widths of the moving mean that rounds corners, tried in turn where they are too sharp."""
-
-_LOWER = "slice with less of it, or raise that to what the motors bear (docs/safety.md)"
-_SHORT_QUEUES = {"marlin": "Marlin", "reprapfirmware": "RepRapFirmware"}
-_SLACK = 1.0 + 1e-9
-"""Factor of limits that allows for rounding."""
-
-
-class Unfit(ValueError):
-    """A piece that should stay as sliced; the message says why."""
-
-
-class _TooAbrupt(Unfit):
-    """A motor's speed step is too large, or the firmware cannot follow within its limits."""
-
-
-@dataclass(frozen=True, slots=True)
-class CompensatedPiece:
-    """A piece with its command.
-
-    Attributes
-    ----------
-    command_mm : ndarray, shape (4, n)
-        x y as commanded, z as planned, e along the command (`pipeline.filament`), on the
-        timeline's grid.
-    extruding : ndarray of bool, shape (n,)
-    step_mm, bend_mm : float
-        Longest step of the command in XY, and largest second difference of either axis.
-    keeps_ripple : bool
-        Its ripple is not compensated, although that was asked for.
-    """
-
-    timeline: Timeline
-    command_mm: NDArray[np.float64]
-    extruding: NDArray[np.bool_]
-    segments: Segments
-    encoded: Encoded
-    step_mm: float
-    bend_mm: float
-    keeps_ripple: bool
 
 
 class PieceCompensator:
@@ -122,17 +73,12 @@ class PieceCompensator:
         firmware = adapter(machine)
         self.encoder = firmware.encoder()
         self._step_mm = firmware.step_mm
+        self._limits = MotionLimits(machine, firmware.step_mm)
         self._follow_mm = follow_tolerance_mm(firmware, options.tolerance_um)
         self._filter = _error_filter(machine)
         # A shaper ends after the plan by itself.
         ends_with_plan = options.vibration == "fbf" and not self.compensator.tail_s
         self._standing = Standing(machine, DT_S) if ends_with_plan else None
-        command = machine.command
-        steps = [command.of(axis).speed_step_mm_s for axis in ("x", "y")]
-        # One limit serves both axes: the motion of an axis with a higher limit is scaled down.
-        self._direction_scale = np.array(
-            [*(command.speed_step_mm_s / step for step in steps), 1.0, 1.0]
-        )
         self._grid = OperatingGrid(machine, step=DESIGN_STEP, blend_step=BLEND_STEP)
         self._level: OperatingPoint | None = None
 
@@ -163,26 +109,26 @@ class PieceCompensator:
         the command; rounder corners; only the acceleration that the path itself needs. If all of
         them fail, the first refusal is raised.
         """
-        refusals: list[_TooAbrupt | DesignError] = []
+        refusals: list[TooAbrupt | DesignError] = []
         for share in _ACCEL_SHARES:
             if not self.compensator.ease(share):
                 raise refusals[0]
             try:
                 return self._compensate_once(piece)
-            except _TooAbrupt as error:
+            except TooAbrupt as error:
                 refusals.append(error)
             except DesignError as error:
                 # With less acceleration it does not follow the path.
                 refusals.append(error)
                 break
         self.compensator.ease(1.0)
-        with contextlib.suppress(_TooAbrupt, DesignError):
+        with contextlib.suppress(TooAbrupt, DesignError):
             return self._compensate_once(piece, briefly=True)
         for rounding_s in _ROUNDING_S:
-            with contextlib.suppress(_TooAbrupt, DesignError):
+            with contextlib.suppress(TooAbrupt, DesignError):
                 return self._compensate_once(piece, rounding_s)
         if self.compensator.ease(0.0):
-            with contextlib.suppress(_TooAbrupt, DesignError):
+            with contextlib.suppress(TooAbrupt, DesignError):
                 return self._compensate_once(piece)
         raise refusals[0]
 
@@ -215,8 +161,8 @@ class PieceCompensator:
             timeline = build_timeline(phases, groups, rest_s, DT_S, lead_s=lead_s, tail_s=tail_s)
             extruding = timeline.moving & feeds[timeline.row]
             command = self._command(timeline, phases, extruding, rounding_s)
-            self._check_travel(command[:2], timeline.row, piece)
-            self._check_motors(command[:2])
+            self._limits.check_travel(command[:2], timeline.row, piece)
+            self._limits.check_motors(command[:2])
             step_mm, bend_mm = peaks(command)
             segments, encoded = self._fit(piece, timeline, command, bend_mm)
             change = np.max(np.abs(encoded.rest_s - rest_s)[resting], initial=0.0)
@@ -226,7 +172,7 @@ class PieceCompensator:
         # Vertices are rounded to samples, and moved where they would coincide.
         at = np.rint(encoded.start_s / DT_S).astype(np.int64)
         row = timeline.row[np.minimum(at, len(timeline.row) - 1)]
-        self._check_travel(encoded.position[:, :2].T / 1e6, row, piece)
+        self._limits.check_travel(encoded.position[:, :2].T / 1e6, row, piece)
         # Not asked by type: `compensation.ripple` is slow to import and seldom needed.
         keeps_ripple = getattr(self.compensator, "keeps_ripple", False)
         peak_mm = (step_mm, bend_mm)
@@ -236,7 +182,9 @@ class PieceCompensator:
         gap_mm = deviation(made, encoded.phases)
         reason = strayed(gap_mm, extruding, self._follow_mm, briefly=briefly)
         if reason is not None:
-            raise _TooAbrupt(f"planned by the firmware's rules, {reason}{self._too_slow(piece)}")
+            raise TooAbrupt(
+                f"planned by the firmware's rules, {reason}{self._limits.remedy(piece)}"
+            )
         return made
 
     def _command(
@@ -268,40 +216,14 @@ class PieceCompensator:
         begin_s, end_s = self._standing.of(phases, groups)
         return lead_s + begin_s, tail_s + end_s
 
-    def _too_slow(self, piece: Piece) -> str:
-        """Return what to do if the file accelerates more than the command may.
-
-        Or where a firmware with few moves in its queue stays below their speed.
-        """
-        command, phases = self._machine.command, piece.phases
-        kind = self._machine.firmware.kind
-        xy_mm_s2 = np.abs(phases.direction[:, :2]) * phases.accel_mm_s2[:, None]
-        limits = command.of("x").accel_mm_s2, command.of("y").accel_mm_s2
-        for axis, asked, limit in zip("XY", xy_mm_s2.max(axis=0, initial=0.0), limits, strict=True):
-            # Marlin's phases stand for ramps of whole steps, with accelerations of their own.
-            if kind != "marlin" and asked > _SLACK * limit:
-                return (
-                    f"; as sliced, {axis} accelerates by {asked:.0f} mm/s2, more than the "
-                    f"command may ({limit:g}, command.accel_mm_s2): {_LOWER}"
-                )
-        name = _SHORT_QUEUES.get(kind)
-        if name is None:
-            return ""
-        return (
-            f"; {name} does not reach the speed of short moves where command.accel_mm_s2 "
-            f"({command.accel_mm_s2:g}) is low: raise it to what the motors bear (docs/safety.md)"
-        )
-
     def _fit(
         self, piece: Piece, timeline: Timeline, command: NDArray[np.float64], bend_mm: float
     ) -> tuple[Segments, Encoded]:
         """Return segments and moves, finer where a motor's speed step would be too large."""
-        limit = self._machine.command.speed_step_mm_s
-        # A fast machine's own acceleration changes its speed by more.
-        most = max(limit, 1e-3 * self._path_accel_mm_s2)
+        limits = self._limits
         tolerance = self._tolerance_mm
         # The command's own speed may change by more within a sample.
-        step_mm_s = max(bend_mm / timeline.dt_s, _STEP_SHARE * limit)
+        step_mm_s = max(bend_mm / timeline.dt_s, _STEP_SHARE * limits.speed_step_mm_s)
         for _ in range(3):
             grid_mm = max(
                 self.encoder.grid_mm, _COARSE_GRID_MM if tolerance >= 1e-3 * COARSE_UM else 0.0
@@ -316,85 +238,21 @@ class PieceCompensator:
                 grid_mm=grid_mm,
                 ends=timeline.starts(piece.marked_rows),
             )
-            self._keep_inside(segments, grid_mm)
+            limits.keep_inside(segments, grid_mm)
             encoded = self.encoder.encode(piece, timeline, segments)
             if len(encoded.row) == 0:
                 line = int(piece.moves.line[0])
                 raise Unfit(f"line {line}: all moves round to zero at the resolution of a file")
-            step, change = self._speed_steps(encoded.phases)
-            if step <= limit and change <= most:
+            step, change = limits.speed_steps(encoded.phases)
+            if step <= limits.speed_step_mm_s and change <= limits.speed_change_mm_s:
                 return segments, encoded
             tolerance *= 0.5
-        raise _TooAbrupt(
+        raise TooAbrupt(
             f"a motor's speed would step by {step:.0f} mm/s between two segments, and change by "
-            f"{change:.0f} mm/s within a millisecond; the machine allows {limit:.0f} and "
-            f"{most:.0f} mm/s (command.speed_step_mm_s, accel_mm_s2)"
+            f"{change:.0f} mm/s within a millisecond; the machine allows "
+            f"{limits.speed_step_mm_s:.0f} and {limits.speed_change_mm_s:.0f} mm/s "
+            "(command.speed_step_mm_s, accel_mm_s2)"
         )
-
-    def _keep_inside(self, segments: Segments, grid_mm: float) -> None:
-        """Clamp vertices that the fit's tolerance or the grid would put off the bed."""
-        for i, axis in enumerate(("x", "y")):
-            travel = self._machine.travel[axis]  # type: ignore[index]
-            # Outermost grid lines on the bed, with a margin for rounding.
-            low = np.ceil(travel.min_mm / grid_mm - 1e-6) * grid_mm
-            high = np.floor(travel.max_mm / grid_mm + 1e-6) * grid_mm
-            np.clip(segments.end_mm[i], low, high, out=segments.end_mm[i])
-
-    @property
-    def _path_accel_mm_s2(self) -> float:
-        """Largest acceleration of a motor while the head accelerates along its path."""
-        corexy = self._machine.kinematics == "corexy"
-        return self._machine.command.accel_mm_s2 * (np.sqrt(2.0) if corexy else 1.0)
-
-    def _speed_steps(self, phases: Phases) -> tuple[float, float]:
-        """Return the largest step of a motor's speed, and its change within a millisecond."""
-        return speed_steps(
-            phases.accel_s,
-            phases.cruise_s,
-            phases.decel_s,
-            phases.start_mm_s,
-            phases.cruise_mm_s,
-            phases.accel_mm_s2,
-            phases.direction * self._direction_scale,
-            max(self._step_mm[:2]),
-            # Ramps are shorter than a motor step there, so the motor does not notice them.
-            max(self._step_mm) > 0.0,
-            self._machine.kinematics == "corexy",
-        )
-
-    def _check_motors(self, command_mm: NDArray[np.float64]) -> None:
-        """Check that X and Y (2, n) together keep the motor limits of a CoreXY."""
-        motors = self._machine.command.motors
-        if motors is None:
-            return
-        x, y = command_mm
-        for order, unit, limit in (
-            (1, "mm/s", motors.velocity_mm_s),
-            (2, "mm/s2", motors.accel_mm_s2),
-        ):
-            changes = np.diff([x + y, x - y], order)
-            asked = float(np.abs(changes).max(initial=0.0)) / DT_S**order
-            if limit is not None and asked > _SLACK * limit:
-                raise _TooAbrupt(
-                    f"X and Y together ask a motor for {asked:.0f} {unit}; the machine allows "
-                    f"{limit:.0f} {unit} (command.motors): {_LOWER}"
-                )
-
-    def _check_travel(
-        self, place_mm: NDArray[np.float64], row: NDArray[np.int64], piece: Piece
-    ) -> None:
-        """Check that positions (2, n), each with its row in the phases, lie within the travel."""
-        for i, axis in enumerate(("x", "y")):
-            travel = self._machine.travel[axis]  # type: ignore[index]
-            beyond = np.maximum(travel.min_mm - place_mm[i], place_mm[i] - travel.max_mm)
-            worst = int(np.argmax(beyond))
-            # A sum of weights 1 misses by rounding; vertices are clamped in any case.
-            if beyond[worst] > TRAVEL_SLACK_MM:
-                line = int(piece.moves.line[piece.phases.move_index[row[worst]]])
-                raise Unfit(
-                    f"line {line}: the command would take {axis} to {place_mm[i, worst]:.4f} mm, "
-                    f"outside {travel.min_mm:.7g} to {travel.max_mm:.7g} mm"
-                )
 
 
 def _designed(
@@ -429,52 +287,3 @@ def _mean(path_mm: NDArray[np.float64], reach: int) -> NDArray[np.float64]:
 
 def _error_filter(machine: Machine) -> ErrorFilter:
     return ErrorFilter([plant_set(machine.axes[a], DT_S).nominal for a in ("x", "y")])
-
-
-def deviation(piece: CompensatedPiece, executed: Phases) -> NDArray[np.float64]:
-    """Return the XY distance [mm] of executed motion from the command at its samples, shape (n,).
-
-    Each stretch is timed from its own start: rests may be slightly longer or shorter than planned.
-    """
-    timeline, encoded = piece.timeline, piece.encoded
-    first = np.round(timeline.start_s / timeline.dt_s - 0.5).astype(np.int64)
-    np.clip(first, 0, piece.command_mm.shape[1], out=first)
-    first[0] = 0
-    origin_s = timeline.start_s[0]
-    return distances(
-        executed,
-        piece.command_mm,
-        timeline.dt_s,
-        first,
-        encoded.group_start_s - timeline.start_s - origin_s,
-        # During a rest, time stops at the beginning of the next stretch.
-        np.append(encoded.group_start_s[1:], np.inf) - origin_s,
-    )
-
-
-def as_executed(
-    piece: CompensatedPiece, phases: Phases, executed: Phases
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64], NDArray[np.bool_]]:
-    """Return planned and executed motion of a piece on one time grid.
-
-    Parameters
-    ----------
-    phases : Phases
-        The intended motion (`gcode.firmware.planning.intended`).
-
-    Returns
-    -------
-    planned_mm, executed_mm : ndarray, shapes (3, n) and (2, n)
-    row : ndarray of int64, shape (n,)
-        Row in the piece's `phases`.
-    extruding : ndarray of bool, shape (n,)
-    """
-    dt_s = piece.timeline.dt_s
-    origin = float(piece.timeline.start_s[0])
-    last = executed.lasts_s[-1]
-    n = int(np.ceil((float(executed.t_s[-1] + last) + origin) / dt_s - 1e-3)) + 1
-    moved = replace(phases, t_s=piece.encoded.row_start_s)
-    until = np.where(phases.prints, moved.t_s + phases.lasts_s, -np.inf)
-    planned, row, extruding = sample_until(moved, (0.0, dt_s, n), until, axes=3)
-    position, _ = sample_phases(executed, (-origin, dt_s, n), flat=True)
-    return planned, position, row, extruding

@@ -17,19 +17,19 @@ from typing import TYPE_CHECKING, BinaryIO
 import numpy as np
 
 from stillpath.compensation.base import DesignError
+from stillpath.compensation.defaults import DT_S
 from stillpath.gcode.errors import GcodeError
-from stillpath.gcode.firmware.planning import join_phases
 from stillpath.gcode.firmware.registry import adapter
-from stillpath.gcode.firmware.writing import StreamWriter
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.pieces import LeftOut, Piece, VerbatimPart
-from stillpath.gcode.plan import plan_moves
 from stillpath.gcode.slicers.facts import SlicerFacts
 from stillpath.gcode.slicers.retiming import Retiming
 from stillpath.gcode.splitter import Splitter
 from stillpath.gcode.types import Events, Moves, Phases, ProgramBlock
 from stillpath.models.errors import ModelError
+from stillpath.models.schedule import EMPTY
 from stillpath.pipeline.clock import StageClock
+from stillpath.pipeline.compensated_piece import CompensatedPiece, Unfit, deviation
 from stillpath.pipeline.endless import LengthGuard
 from stillpath.pipeline.file_dialect import (
     dialect_for,
@@ -50,14 +50,8 @@ from stillpath.pipeline.options import stamp
 from stillpath.pipeline.order import Order
 from stillpath.pipeline.pacing.budget import SpeedBudget
 from stillpath.pipeline.pacing.budget_measure import BudgetMeasurement
-from stillpath.pipeline.pacing.samples import take_samples
+from stillpath.pipeline.pacing.excerpts import take_excerpts
 from stillpath.pipeline.parts import FileParts
-from stillpath.pipeline.piece_compensator import (
-    DT_S,
-    CompensatedPiece,
-    Unfit,
-    deviation,
-)
 from stillpath.pipeline.progress import ProgressReports
 from stillpath.pipeline.result import PutBack, Result, StageTime
 from stillpath.pipeline.selection import Selection, TooLarge
@@ -72,6 +66,7 @@ from stillpath.pipeline.verbatim import (
     takes_s,
 )
 from stillpath.pipeline.verifying import Verifier
+from stillpath.pipeline.written_text import WrittenText
 
 if TYPE_CHECKING:
     from _typeshed import SupportsWrite
@@ -102,9 +97,9 @@ class PieceAttempt:
 class PipelineRun:
     """One run of the pipeline over one file.
 
-    The text stays in `target` until its times are known; `retiming` then copies it. Two
-    interpreters follow the file side by side: `_reader` the sliced one, `_checker` what is written
-    of it. Where the file is not changed there is no `_piece_compensator`, `_verifier` or `_writer`.
+    The text stays in `target` until its times are known; `retiming` then copies it. `_reader`
+    follows the sliced file, and `_written` what is written of it. Where the file is not changed
+    there is no `_piece_compensator`, `_verifier` or `_written`.
 
     Parameters
     ----------
@@ -152,10 +147,11 @@ class PipelineRun:
         dialect, unsaid = extruder_mode_awaited(source, machine, own)
         self._length = LengthGuard(source, machine, dialect)
         self._reader = Interpreter(machine, dialect=dialect)
-        self._checker = Interpreter(machine, dialect=dialect)
         self._splitter = Splitter(machine, compensate=self._changes)
         self._selection = Selection(options.where, machine)
         self._operation = Operation(machine)
+        self._point = EMPTY
+        """Operating point of the item in hand."""
         measures = BudgetMeasurement if options.paced else Measurement
         self._measurement = measures(
             machine,
@@ -169,10 +165,11 @@ class PipelineRun:
         if self._design.piece_compensator is not None:
             self._piece_compensator = self._design.piece_compensator
             self._verifier = Verifier(machine, options.tolerance_um)
-            self._writer = StreamWriter(self._adapter, stamp(machine, options))
+            self._written = WrittenText(machine, dialect, stamp(machine, options))
             followers = Followers(self._piece_compensator.compensator, self._verifier)
         self._motion = MotionRecord(self._adapter.step_mm, self._measurement, self._sum, followers)
-        ends = (self._writer.header(), self._writer.footer()) if self._changes else ()
+        writer = self._written.writer if self._changes else None
+        ends = () if writer is None else (writer.header(), writer.footer())
         self._sum.written_bytes = sum(len(text) for text in ends)
         self.retiming = Retiming(*ends, keep_times=options.times == "kept" or not self._changes)
         self._sum.warnings += [*dialect_warnings(source, machine, options.dialect), *unsaid]
@@ -224,8 +221,8 @@ class PipelineRun:
         if self._sum.moves == 0:
             raise no_moves(self._reader.dialect)
         if self._changes:
-            text = self._writer.end(self._sum.newline, self._checker.extruder_mm)
-            self._motion.wait(switching_s(self._checker.push(text)))
+            text = self._written.end(ends_with_newline=self._sum.newline)
+            self._motion.wait(switching_s(self._written.read_back(text)))
             self._count(self.retiming.end(text.lstrip(b"\n")))
         self._measurement.finish()
         if self._layers is not None:
@@ -258,7 +255,7 @@ class PipelineRun:
     def _chosen_paces(self, size: int) -> SpeedBudget:
         self._source.seek(0)
         with self._clock.stage("budget"):
-            found = take_samples(
+            found = take_excerpts(
                 self._source,
                 self._machine,
                 dialect_for(self._machine, self._options.dialect),
@@ -292,7 +289,7 @@ class PipelineRun:
         self._sum.original_s += piece.phases.duration_s
         lines = int(piece.moves.line[0]), int(piece.moves.line[-1])
         paces = iter((piece,)) if self._budget is None else self._budget.paced(piece)
-        refusal = self._order.refusal(*lines) or self._writer.shaper_test(piece)
+        refusal = self._order.refusal(*lines) or self._written.writer.shaper_test(piece)
         if refusal is not None:
             next(paces)  # counts the time with the shaper
             self._put_back(piece, refusal)
@@ -338,8 +335,7 @@ class PipelineRun:
 
         This precedes the compensation of the piece: vibration dies down meanwhile.
         """
-        lines = self._writer.leading(piece, self._checker.extruder_mm)
-        blocks = self._checker.snapshot().push(lines) if lines else []
+        blocks = self._written.leading(piece)
         seconds, moving = switching_s(blocks), [block for block in blocks if len(block.moves)]
         seconds += sum(flowing_s(self._verbatim_before, b, self._machine) for b in moving)
         self._motion.wait(seconds)
@@ -356,18 +352,14 @@ class PipelineRun:
         piece, paced : Piece
             As sliced, and as planned at the new pace.
         """
-        writer, checker = self._writer.snapshot(), None
+        before = self._written.snapshot()
         try:
             with self._clock.stage("compensate"):
                 made = self._piece_compensator.compensate(paced, self._point)
             with self._clock.stage("write"):
-                extruder_mm = self._checker.extruder_mm
-                lead = self._writer.leading(piece, extruder_mm) if piece.after_mark else b""
-                text = self._writer.piece(piece, made.encoded, extruder_mm)
+                lead, text = self._written.piece(piece, made.encoded)
             with self._clock.stage("read back"):
-                checker = self._checker.snapshot()
-                self._checker.push(lead)
-                executed = self._read_back(text[len(lead) :])
+                executed = self._written.executed(lead, text)
                 gap_mm = deviation(made, executed)
                 self._verifier.check_motion(piece, made, gap_mm, executed)
             with self._clock.stage("measure"):
@@ -375,16 +367,14 @@ class PipelineRun:
                 if self._budget is None:
                     self._verifier.check_gain(motion, self._point)
         except _FAULTS as error:
-            self._writer = writer
-            if checker is not None:
-                self._checker = checker
+            self._written = before
             if isinstance(error, _EXPLAINED):
                 raise
             raise Unfit(
                 f"line {int(piece.moves.line[0])}: internal error ({type(error).__name__}: "
                 f"{error}); please report it with the file"
             ) from error
-        return PieceAttempt(made, executed, gap_mm, text, motion)
+        return PieceAttempt(made, executed, gap_mm, lead + text, motion)
 
     def _put_back(self, piece: Piece, reason: str) -> None:
         """Write a piece as sliced and undo what was counted for it."""
@@ -408,9 +398,9 @@ class PipelineRun:
         text = verbatim.text
         blocks: Sequence[VerbatimPart | ProgramBlock] = [verbatim]
         if self._changes:
-            text = self._writer.verbatim(verbatim, self._checker.extruder_mm)
+            text = self._written.verbatim(verbatim)
             with self._clock.stage("read back"):
-                blocks = self._checker.push(text)
+                blocks = self._written.read_back(text)
             # Our own lines can also add standstill, or lengthen the file's.
             self._motion.wait(switching_s(blocks) - switching_s([verbatim]))
             if stops_in(blocks) == stops_in([verbatim]):
@@ -445,19 +435,7 @@ class PipelineRun:
         if len(lines):
             self._length.check(self._sum.original_s + seconds, int(lines.line[-1]))
 
-    def _read_back(self, text: bytes) -> Phases:
-        """Plan the written lines of a piece by the firmware's rules."""
-        blocks = self._checker.push(text)
-        parts = [(block.moves, block.limits) for block in blocks if len(block.moves)]
-        if len(parts) == 1:
-            return plan_moves(parts[0][0], parts[0][1], self._machine)
-        planner = self._adapter.planner()
-        phases = [planner.push_moves(moves, limits) for moves, limits in parts]
-        return join_phases([*phases, planner.flush()])
-
-    def _emit(
-        self, text: bytes, item: VerbatimPart | None = None, delay_s: float | np.ndarray = 0.0
-    ) -> None:
+    def _emit(self, text: bytes, item: VerbatimPart, delay_s: float | np.ndarray) -> None:
         self._count(len(text))
         self._target.write(text)
         self.retiming.push(text, item, delay_s)
@@ -482,7 +460,7 @@ class PipelineRun:
             selection=self._selection,
             operation=self._operation,
             reader=self._reader,
-            writer=self._writer if self._changes else None,
+            writer=self._written.writer if self._changes else None,
             shaper=self._design.shaper,
             choice=self._design.mixture,
             budget=budget,

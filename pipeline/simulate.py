@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from stillpath.compensation.defaults import DT_S
 from stillpath.compensation.live_filter import LiveFilter
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.signatures import signed_at
@@ -28,7 +29,6 @@ from stillpath.pipeline.measuring.reference_shaper import cached_shaper
 from stillpath.pipeline.measuring.tracing import Trace
 from stillpath.pipeline.operating_point import Operation
 from stillpath.pipeline.options import DialectName
-from stillpath.pipeline.piece_compensator import DT_S
 from stillpath.pipeline.progress import ProgressCallback
 from stillpath.pipeline.result import NOTHING_COMPENSATED, Result
 from stillpath.pipeline.shaping import ShapedMotion
@@ -164,7 +164,7 @@ def simulate_motion(
             writer.finish(motion.feature_names)
     channels = measurement.channels("printed live")
     if live is not None and has_measured_set(machine):
-        channels = measurement.sample.ranged(channels, machine, shaper)
+        channels = measurement.excerpts.ranged(channels, machine, shaper)
     notes = [*operation.notes(), *motion.notes]
     if set(motion.shapers) - {OFF.label}:
         notes.append(f"The file sets the firmware's shaper: {', '.join(motion.shapers)}.")

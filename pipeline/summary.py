@@ -101,7 +101,7 @@ class Summary:
                 c.model_copy(update={"selected_rms_um": rms_um.get(c.name)}) for c in channels
             ]
         if self.choice is not None:
-            channels = self.measurement.sample.ranged(channels, self.machine, self.shaper)
+            channels = self.measurement.excerpts.ranged(channels, self.machine, self.shaper)
         return channels
 
     def _warnings(self, channels: list[Channel], facts: SlicerFacts) -> Iterator[str]:

@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from stillpath.compensation.defaults import DT_S
 from stillpath.gcode.pieces import LeftOut, Piece, VerbatimPart
 from stillpath.gcode.types import Phases
-from stillpath.pipeline.piece_compensator import DT_S, CompensatedPiece
+from stillpath.pipeline.compensated_piece import CompensatedPiece
 from stillpath.pipeline.result import PutBack
 
 __all__ = ["NOT_COMPENSATED", "Totals"]

@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from stillpath.compensation.defaults import DT_S
 from stillpath.gcode.errors import GcodeError
 from stillpath.models.machine import Machine
 from stillpath.pipeline.columns import TableWriter, csv_table, npz_table
@@ -20,7 +21,6 @@ from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.live_printing import simulate_live
 from stillpath.pipeline.measuring.tracing import Trace
 from stillpath.pipeline.options import Options
-from stillpath.pipeline.piece_compensator import DT_S
 from stillpath.pipeline.progress import ProgressCallback, within
 from stillpath.pipeline.simulate import simulate_file
 

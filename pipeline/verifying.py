@@ -8,14 +8,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from stillpath.compensation.defaults import DT_S
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.pieces import Piece
 from stillpath.gcode.types import Phases
 from stillpath.models.machine import Machine
 from stillpath.models.schedule import OperatingPoint
+from stillpath.pipeline.compensated_piece import CompensatedPiece, Unfit
 from stillpath.pipeline.following import follow_tolerance_mm, strayed
 from stillpath.pipeline.measuring.points import MotionSamples
-from stillpath.pipeline.piece_compensator import DT_S, CompensatedPiece, Unfit
 from stillpath.simulation.machine_response import MachineStream
 from stillpath.simulation.measures import MotionMeter
 
@@ -58,7 +59,7 @@ class Verifier:
         Parameters
         ----------
         gap_mm : ndarray, shape (n,)
-            Distance from the command (`pipeline.piece_compensator.deviation`).
+            Distance from the command (`pipeline.compensated_piece.deviation`).
 
         Raises
         ------

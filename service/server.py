@@ -13,7 +13,8 @@ import structlog
 import uvicorn
 
 from stillpath.service.api import create_app
-from stillpath.service.database.engine import DatabaseAway, database_url, open_database
+from stillpath.service.database.engine import database_url, open_database
+from stillpath.service.database.errors import DatabaseAway
 from stillpath.service.instance_lock import exclusive
 from stillpath.service.jobs.task import Runner
 from stillpath.service.jobs.worker import run_compensation

@@ -10,35 +10,31 @@ import numpy as np
 from stillpath.models.arrays import Array
 from stillpath.models.friction import DryFriction
 from stillpath.models.machine import Machine
-from stillpath.models.operating import OperatingGrid, machine_at
+from stillpath.models.operating import BLEND_STEP, REMEMBERED_S, OperatingGrid, machine_at
 from stillpath.models.plants import DiscretePlant, PlantSetSpec, discretise, plant_set
 from stillpath.models.ripple import MachineRipple
 from stillpath.models.schedule import EMPTY, OperatingPoint
 from stillpath.simulation.response import PlantStream
 
-__all__ = ["BLEND_STEP", "REMEMBERED_S", "SIMULATION_STEP", "MachineStream"]
+__all__ = ["SIMULATION_STEP", "MachineStream"]
 
 SIMULATION_STEP = 0.001
 """Ratio, minus 1, by which a resonance moves in mass or height before the plants are taken anew."""
-BLEND_STEP = 0.02
-"""The same from node to node in x and y."""
-REMEMBERED_S = 4.0
-"""How much of the past new plants are shown: vibrations of before have died down by then."""
 
 
 class MachineStream:
-    """Answer of X and Y of a machine to a command that arrives in blocks.
+    """Response of X and Y of a machine to a command that arrives in blocks.
 
-    The nominal plants answer the command with the machine's ripple added and what dry friction
+    The nominal plants respond to the command with the machine's ripple added and what dry friction
     holds back taken off. The machine stands still at the first sample pushed. Where plants depend
-    on x and y, all nodes of the grid answer and are blended by weights of the planned position.
+    on x and y, all nodes of the grid respond and are blended by weights of the planned position.
 
     Parameters
     ----------
     point : OperatingPoint
         Where the machine is at first; without schedules it does not matter.
     member : int, optional
-        The plants with this number in the sets of both axes answer, not the nominal ones; the
+        The plants with this number in the sets of both axes respond, not the nominal ones; the
         shorter list repeats.
     """
 
@@ -84,28 +80,28 @@ class MachineStream:
             self._streams.append(stream)
 
     def push(self, u_mm: Array, path_mm: Array, out: Array | None = None) -> Array:
-        """Return the positions that answer a command, shape (2, n).
+        """Return the response to a command, shape (2, n).
 
         Parameters
         ----------
         u_mm, path_mm : ndarray, shape (2, n)
             The command, and the planned positions that weigh the plants.
         out : ndarray, shape (2, n), optional
-            Where the answer is written to.
+            Where the response is written to.
         """
-        return self.answer(self.received_mm(u_mm), path_mm, out)
+        return self.respond(self.received_mm(u_mm), path_mm, out)
 
     def received_mm(self, u_mm: Array) -> Array:
         """Return the next block of a command as ripple and dry friction let the plants have it."""
         return self._friction.received_mm(self._ripple.received_mm(u_mm))
 
-    def answer(self, received_mm: Array, path_mm: Array, out: Array | None = None) -> Array:
-        """Return the positions that answer a command which the plants have received; see `push`."""
+    def respond(self, received_mm: Array, path_mm: Array, out: Array | None = None) -> Array:
+        """Return the response (2, n) to a command as the plants received it; see `push`."""
         if self._remembered:
             past = np.concatenate([self._past, received_mm], axis=1)
             self._past = past[:, -self._remembered :].copy()
         moved = np.empty(received_mm.shape) if out is None else out
-        self._answer(received_mm, path_mm, moved)
+        self._respond(received_mm, path_mm, moved)
         if self._machine.ripple:
             moved += self._ripple.added_mm(path_mm)
         return moved
@@ -116,7 +112,7 @@ class MachineStream:
         members = plant_set(axis, self._dt_s).members
         return members[self._member % len(members)]
 
-    def _answer(self, u_mm: Array, path_mm: Array, out: Array) -> None:
+    def _respond(self, u_mm: Array, path_mm: Array, out: Array) -> None:
         if len(self._streams) == 1:
             self._streams[0].push(u_mm, out)
             return

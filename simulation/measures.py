@@ -177,6 +177,11 @@ class ContourMeter:
         """Add a block of planned and executed positions, shapes (2, n) and (channels, 2, n).
 
         Returns the errors of the samples whose window has become complete.
+
+        Raises
+        ------
+        ValueError
+            For other shapes.
         """
         if y_mm.shape != (len(self._points), *y_d_mm.shape) or len(y_d_mm) != 2:
             raise ValueError(
@@ -248,7 +253,7 @@ class ChosenMeter:
         return self._measure(self._path.shape[1] - self._window)
 
     def flush(self) -> Array:
-        """Return the errors of the samples still waiting; see `ContourMeter.flush`."""
+        """Return the errors (channels, m) of the samples that wait; see `ContourMeter.flush`."""
         errors = self._measure(self._path.shape[1])
         self._path = self._path[:, :0]
         return errors
@@ -375,7 +380,7 @@ def tracking_error(y_d_mm: Array, y_mm: Array) -> Array:
 
 
 def contour_error(y_d_mm: Array, y_mm: Array, dt_s: float = 1e-3, stride: int = 1) -> Array:
-    """Return contour errors of samples 0, stride, 2 stride, ... of a whole motion (2, n)."""
+    """Return contour errors [mm] of samples 0, stride, 2 stride, ... of a whole motion (2, n)."""
     meter = ContourMeter(dt_s, stride=stride)
     first = meter.push(y_d_mm, y_mm[None])
     return np.concatenate([first.error_mm[0], meter.flush().error_mm[0]])
@@ -397,7 +402,7 @@ class PathDistances:
         self._window = round(window_s / dt_s)
 
     def at(self, points_mm: Array, index: Ints) -> Array:
-        """Return the errors of positions (2, m) at the samples `index`, rising."""
+        """Return the errors [mm] of positions (2, m) at the samples `index`, rising, shape (m,)."""
         out = np.empty(len(index))
         points = np.ascontiguousarray(points_mm)
         contour_distances(self._path, *self._tables, points, index, self._window, out)

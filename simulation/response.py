@@ -110,6 +110,11 @@ class PlantStream:
         """Return the response to the command block `u_mm`, shape (axes, n).
 
         They are written to `out`, if that is given.
+
+        Raises
+        ------
+        ValueError
+            For another number of axes.
         """
         u = np.asarray(u_mm, dtype=np.float64)
         if u.ndim != 2 or len(u) != len(self._axes):

@@ -28,3 +28,10 @@ def test_every_module_is_named_on_the_page_of_the_architecture(layer: str) -> No
     modules = [path for path in modules if "migrations" not in path.parts]
     missing = [path.relative_to(HERE).as_posix() for path in modules if not is_found(path)]
     assert missing == [], "say in docs/architecture.md what it is for"
+
+
+def test_every_module_that_the_page_names_is_there() -> None:
+    named = set(re.findall(r"`(?:[\w/]*/)?(\w+\.py)`", PAGE))
+    layers = [path for one in (*LAYERS, "tests", "docs") for path in (HERE / one).rglob("*.py")]
+    assert len(named) > 100
+    assert named - {path.name for path in layers} == set()

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import ast
+import importlib
 import json
 import os
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -59,6 +63,29 @@ def test_it_runs(command: list[str]) -> None:
 
 
 @pytest.mark.slow
+def is_module(package: ModuleType, name: str) -> bool:
+    return hasattr(package, "__path__") and find_spec(f"{package.__name__}.{name}") is not None
+
+
+@pytest.mark.parametrize("folder", ["benchmarks", "docs", "examples"])
+def test_what_scripts_import_is_there(folder: str) -> None:
+    """Also within functions that no other test calls."""
+    taken = {
+        (node.module, name.name)
+        for path in (ROOT / folder).rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text("utf-8")))
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("stillpath.")
+        for name in node.names
+    }
+    assert taken
+    missing = []
+    for module, name in sorted(taken):
+        found = importlib.import_module(module)
+        if not hasattr(found, name) and not is_module(found, name):
+            missing.append(f"{module}.{name}")
+    assert missing == []
+
+
 @pytest.mark.parametrize(
     "script",
     sorted(p.name for p in ROOT.glob("benchmarks/*.py") if "from tests." in p.read_text("utf-8")),

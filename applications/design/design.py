@@ -31,7 +31,7 @@ from stillpath.applications.design.figures import (
 from stillpath.applications.design.robustness import OffDesignTrial
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.basis import BASES, ZERO
-from stillpath.compensation.defaults import DEFAULT_BASIS
+from stillpath.compensation.defaults import DEFAULT_BASIS, DT_S
 from stillpath.compensation.fbf import ROBUST, UPDATE_S, WINDOW_S, PreviewFbf
 from stillpath.compensation.ladder import Designs, designs, functions_within
 from stillpath.compensation.lifted import LiftedSet, integrated, lift, lifted_set
@@ -57,8 +57,7 @@ __all__ = ["AXES", "ERRORS_PERCENT", "design_report"]
 AXES = ("x", "y")
 ERRORS_PERCENT = tuple(range(-20, 21, 2))
 """Frequency errors at which every command is evaluated."""
-_DT_S = 1e-3
-_WINDOW, _UPDATE = round(WINDOW_S / _DT_S), round(UPDATE_S / _DT_S)
+_WINDOW, _UPDATE = round(WINDOW_S / DT_S), round(UPDATE_S / DT_S)
 _FREQUENCIES_HZ = tuple(np.geomspace(5.0, 200.0, 160).round(3).tolist())
 
 
@@ -94,11 +93,11 @@ def design_report(
         For an unknown axis, basis or robust mode; why a design is refused stands in the report.
     """
     made = _designed(machine, axis, basis, robust)
-    trial = OffDesignTrial(machine, axis, _DT_S, motion, errors_percent)
+    trial = OffDesignTrial(machine, axis, DT_S, motion, errors_percent)
     missing = [*made.missing, *trial.notes]
     own = _own_curves(trial, made.by_mode, made.ladder, missing)
     if tuned is None:
-        tuned = tune_each(machine, trial.y_d_mm, _DT_S, trial.extruding, shapers)
+        tuned = tune_each(machine, trial.y_d_mm, DT_S, trial.extruding, shapers)
     curves = (trial.uncompensated(), *own.values(), *(trial.shaped(tuned[k]) for k in shapers))
     chosen, row = made.by_mode.get(made.mode), made.row
     limit = next((d.accel_limits_mm_s2(trial.y_d_mm)[row] for d in made.by_mode.values()), None)
@@ -153,7 +152,7 @@ class _Designed:
         return {
             "axis": AXES[self.row],
             "robust": self.robust,
-            "sampling_s": _DT_S,
+            "sampling_s": DT_S,
             "window_s": WINDOW_S,
             "update_s": UPDATE_S,
             "plant": _plant(plants, self.by_mode.get("minimax"), self.row),
@@ -168,7 +167,7 @@ def _designed(machine: Machine, axis: str, basis: str, robust: str) -> _Designed
     row = AXES.index(axis)
     spec = machine.axes["x" if axis == "x" else "y"]
     # As in `PreviewFbf`, designs ignore delays of slow motion.
-    plants = plant_set(spec.without_delay(), _DT_S)
+    plants = plant_set(spec.without_delay(), DT_S)
     by_mode, missing = _designers(machine, basis)
     if robust == "auto":
         # As in jobs: if the set is refused, design for the nominal plants.
@@ -186,7 +185,7 @@ def _designed(machine: Machine, axis: str, basis: str, robust: str) -> _Designed
         lifted = lifted_window(members, weights, _WINDOW, _UPDATE)
     # If the compensator is refused entirely, none of its rungs can be used.
     whole = next((text for text in missing if text.startswith(f"fbf {mode}: ")), None)
-    most = functions_within(spec.band_hz, _DT_S)
+    most = functions_within(spec.band_hz, DT_S)
     ladder = _ladder(plants, lifted, basis, whole, most)
     return _Designed(plants, row, by_mode, missing, robust, mode, lifted, ladder)
 
@@ -207,7 +206,7 @@ def _designers(machine: Machine, basis: str) -> tuple[dict[str, PreviewFbf], lis
     made, missing = {}, []
     for mode in ROBUST if sets else ROBUST[:1]:
         try:
-            made[mode] = PreviewFbf(machine, _DT_S, robust=mode, basis=basis)
+            made[mode] = PreviewFbf(machine, DT_S, robust=mode, basis=basis)
         except DesignError as error:
             missing.append(f"fbf {mode}: {error}")
     return made, missing
@@ -258,7 +257,7 @@ def _plant(plants: PlantSet, guarded: PreviewFbf | None, row: int) -> AxisFigure
 
 def _frequencies(machine: Machine, axis: str) -> Frequencies:
     spec = machine.axes["x" if axis == "x" else "y"]
-    plants = plant_set(spec.without_delay(), _DT_S)
+    plants = plant_set(spec.without_delay(), DT_S)
     responses = [p.frequency_response(_FREQUENCIES_HZ) for p in (plants.nominal, *plants.members)]
     gain = np.abs(responses)
     phase_deg = np.degrees(np.unwrap(np.angle(responses), axis=1))
@@ -382,5 +381,5 @@ def _rung(
         condition=design.condition,
         error=robust_error_metric(nominal, controller),
         robust_error=None if every is None else robust_error_metric(every, controller),
-        effort=effort_metric(controller) / _DT_S**2 / 1e3,
+        effort=effort_metric(controller) / DT_S**2 / 1e3,
     )

@@ -17,6 +17,7 @@ import numpy as np
 
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.basis import BASES
+from stillpath.compensation.defaults import DT_S
 from stillpath.compensation.full_preview import FullPreview, Solvability
 from stillpath.compensation.ladder import functions_within
 from stillpath.compensation.lifted import LiftedSet, lift, lifted_set
@@ -36,7 +37,6 @@ Nominal = Literal["plant", "ensemble", "optimum", "frequency"]
 the nominal model (4.28), or G_r (I.3) with its kernel distribution (I.5)."""
 MOST_SAMPLES = 3000
 """Robust functions of so many take a minute and 1 GB."""
-_DT_S = 1e-3
 _SLOW_FIRST = ("bspline", "dct")
 _AXES: tuple[Literal["x", "y"], ...] = ("x", "y")
 
@@ -104,7 +104,7 @@ def track(
     """
     plants = _plants(machine, axis, basis, nominal)
     band_hz = machine.axes["x" if axis == "x" else "y"].band_hz
-    rest = round(rest_s / _DT_S)
+    rest = round(rest_s / DT_S)
     y_d, scale = _desired(path_mm, rest)
     m = len(y_d)
     n = functions if functions is not None else _count(basis, band_hz, m)
@@ -181,7 +181,7 @@ def read_path(file: Path, axis: str) -> Array:
 def write_tracked(tracked: Tracked, target: Path) -> None:
     """Write path, command and output as a table, whole or not at all."""
     columns = {
-        "t_s": np.arange(len(tracked.path_mm)) * _DT_S,
+        "t_s": np.arange(len(tracked.path_mm)) * DT_S,
         "path_mm": tracked.path_mm,
         "command_mm": tracked.command_mm,
         "output_mm": tracked.output_mm,
@@ -198,7 +198,7 @@ def _plants(machine: Machine, axis: str, basis: str, nominal: str) -> PlantSet:
     ):
         if given not in known:
             raise DesignError(f"no {what} is called {given!r}; there are {', '.join(known)}")
-    plants = plant_set(machine.axes["x" if axis == "x" else "y"].without_delay(), _DT_S)
+    plants = plant_set(machine.axes["x" if axis == "x" else "y"].without_delay(), DT_S)
     if len(plants.members) == 1 and (basis == "robust" or nominal != "plant"):
         asked = "--basis robust" if basis == "robust" else f"--nominal {nominal}"
         raise DesignError(
@@ -213,7 +213,7 @@ def _count(basis: str, band_hz: tuple[float, float] | None, m: int) -> int:
     if basis not in _SLOW_FIRST:
         # What the plant answers most comes first: slow motion may be behind a whole resonance.
         return m // 2
-    return max(1, min(m // 2, functions_within(band_hz, _DT_S) * m // 300))
+    return max(1, min(m // 2, functions_within(band_hz, DT_S) * m // 300))
 
 
 def _set_of(plants: PlantSet, m: int) -> LiftedSet:

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 from pydantic import ValidationError
 
-from stillpath.applications.identification.run import LARGEST_BYTES, InputFile, read_inputs
+from stillpath.applications.identification.run import InputFile, read_inputs
 from stillpath.models.complaints import explain
 from stillpath.models.errors import ModelError
+from stillpath.models.identification.readers import LARGEST_BYTES
 from stillpath.models.identification.readers.compressed import unpacked
 from stillpath.models.identification.readers.tables import check_size
 from stillpath.models.identification.ripple import RippleLearning, WaveBasis

@@ -16,6 +16,7 @@ from stillpath.applications.identification.figures import IdentificationReport
 from stillpath.applications.identification.report import identification_report
 from stillpath.applications.proof.ring_identification import stops_of
 from stillpath.applications.proof.ring_motion import begins_ring_test
+from stillpath.compensation.defaults import DT_S
 from stillpath.gcode.errors import GcodeError
 from stillpath.models.complaints import explain
 from stillpath.models.errors import ModelError
@@ -23,7 +24,7 @@ from stillpath.models.friction import usual_guides
 from stillpath.models.identification.conditioned import schedulable
 from stillpath.models.identification.conditions import Condition
 from stillpath.models.identification.identify import Measured, Progress, identify
-from stillpath.models.identification.readers import ReadSettings, read_content
+from stillpath.models.identification.readers import LARGEST_BYTES, ReadSettings, read_content
 from stillpath.models.identification.types import AccelerationLog, AxisIdentification, Spectrum
 from stillpath.models.machine import Machine
 from stillpath.models.plants import PlantSpec, discretise
@@ -33,8 +34,6 @@ from stillpath.models.user_files import read_bytes
 
 __all__ = ["Identified", "InputFile", "identify_files", "read_inputs"]
 
-LARGEST_BYTES = 200_000_000
-_DT_S = 1e-3
 Axis: TypeAlias = Literal["x", "y"]
 
 
@@ -197,10 +196,10 @@ def _dated(found: AxisIdentification) -> AxisIdentification:
 def _check_sampled(axis: Axis, plant: PlantSpec) -> None:
     """Refuse a model that no command can be designed for, before it is stored."""
     try:
-        discretise(plant, _DT_S)
+        discretise(plant, DT_S)
     except ModelError as error:
         raise ModelError(
-            f"axis {axis.upper()}: commands have a sample every {_DT_S * 1e3:g} ms, and {error}"
+            f"axis {axis.upper()}: commands have a sample every {DT_S * 1e3:g} ms, and {error}"
         ) from None
 
 

@@ -7,11 +7,12 @@ import json
 from pathlib import Path
 from typing import Any
 
+from stillpath.compensation.defaults import DT_S
 from stillpath.models.firmware import Klipper
 from stillpath.models.machine import Machine
 from stillpath.pipeline.error_range import ErrorRange
 from stillpath.pipeline.files import default_cache_dir, replacing
-from stillpath.pipeline.live_design import DT_S, LiveDesign, cached_live_design
+from stillpath.pipeline.live_design import LiveDesign, cached_live_design
 from stillpath.version import __version__
 
 __all__ = [

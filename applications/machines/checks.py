@@ -7,7 +7,8 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict
 
-from stillpath.applications.machines.klipper_config import PrinterConfig, facts
+from stillpath.applications.machines.klipper_config import PrinterConfig
+from stillpath.applications.machines.klipper_facts import facts
 from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
 

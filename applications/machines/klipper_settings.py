@@ -7,7 +7,8 @@ from typing import Any
 from pydantic import ValidationError
 
 from stillpath.applications.machines.envelope import changed_to, derived_envelope
-from stillpath.applications.machines.klipper_config import PrinterConfig, facts
+from stillpath.applications.machines.klipper_config import PrinterConfig
+from stillpath.applications.machines.klipper_facts import facts
 from stillpath.applications.machines.stated import StatedMachine, stated_axis
 from stillpath.models.complaints import explain
 from stillpath.models.errors import ModelError

@@ -106,6 +106,11 @@ def drive(machine: Machine, flow_mm_s: float, run_mm: float) -> Drive:
         Fastest speed of the hotend.
     run_mm : float
         Length within which to accelerate and brake.
+
+    Raises
+    ------
+    ModelError
+        If they ring too much at every speed.
     """
     best: tuple[tuple[float, ...], Drive] | None = None
     modes = [ringing_mode(machine.axes[axis].nominal) for axis in AXES]

@@ -96,7 +96,13 @@ def motor_test(machine: Machine, most_accel_mm_s2: float) -> str:
 
 
 def levels_of(text: str) -> list[Level]:
-    """Return the levels of a file that `motor_test` wrote."""
+    """Return the levels of a file that `motor_test` wrote.
+
+    Raises
+    ------
+    ModelError
+        If it holds none.
+    """
     found = [Level(float(accel), float(step)) for _, accel, step in _LEVEL.findall(text)]
     if not found:
         raise ModelError("the file has no levels; it must be what `stillpath motor-test` wrote")

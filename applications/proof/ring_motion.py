@@ -134,7 +134,13 @@ def read_ring_motion(printed: Path, machine: Machine) -> RingMotion:
 
 
 def ring_motion(content: bytes, name: str, machine: Machine) -> RingMotion:
-    """Return what `read_ring_motion` does, of a ring test's content; `name` is for messages."""
+    """Return what `read_ring_motion` does, of a ring test's content; `name` is for messages.
+
+    Raises
+    ------
+    ModelError
+        If it is not a whole ring test.
+    """
     rows, numbers = [], []
     motion = TextMotion(BytesIO(content), machine, dialect_for(machine, None), 1.0 / RATE_HZ)
     samples = 0

@@ -19,8 +19,9 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from stillpath.pipeline.files import replacing, sync
 from stillpath.service.instance_lock import exclusive
+from stillpath.service.storage.base import sha256_of
 
-__all__ = ["Figures", "Outcome", "OutputFolder", "Scratch", "State", "Trouble", "sha256_of"]
+__all__ = ["Figures", "Outcome", "OutputFolder", "Scratch", "State", "Trouble"]
 
 State = Literal["done", "done before", "failed"]
 Trouble = Literal["", "file", "machine", "computer", "work"]
@@ -28,7 +29,6 @@ Trouble = Literal["", "file", "machine", "computer", "work"]
 itself broke (a process that died, memory, time, an error of the program) and may do so again."""
 
 _RECORD = "record.json"
-_CHUNK_BYTES = 1 << 20
 
 
 class Figures(BaseModel):
@@ -215,15 +215,6 @@ class OutputFolder:
 
     def _record(self, output: str) -> Path:
         return self._records / f"{_short(output)}.json"
-
-
-def sha256_of(path: Path) -> str:
-    """Return the SHA-256 of a file's content."""
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while chunk := file.read(_CHUNK_BYTES):
-            digest.update(chunk)
-    return digest.hexdigest()
 
 
 @contextmanager

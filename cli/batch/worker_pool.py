@@ -23,7 +23,8 @@ from stillpath.cli.batch.local_workers import (
     Stopped,
     failure_of,
 )
-from stillpath.cli.batch.output import Outcome, OutputFolder, Scratch, sha256_of
+from stillpath.cli.batch.output import Outcome, OutputFolder, Scratch
+from stillpath.service.storage.base import sha256_of
 from stillpath.version import build
 
 if TYPE_CHECKING:

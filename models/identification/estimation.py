@@ -102,7 +102,13 @@ def estimate_response(
 def estimate_aligned(
     log: AccelerationLog, aligned: AlignedLog, *, label: str = ""
 ) -> FrequencyResponse:
-    """Return the response from a log that is aligned already; its level is not checked."""
+    """Return the response from a log that is aligned already; its level is not checked.
+
+    Raises
+    ------
+    ModelError
+        If the log shows too little of the sweep, or too few samples per second.
+    """
     first, last = aligned.excitation.f_start_hz + 1.0, aligned.f_reached_hz - 1.0
     if last < first + 1.0:
         raise ModelError(

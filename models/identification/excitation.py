@@ -83,7 +83,8 @@ class VelocityProfile:
     def cell_averages(self, time_s: ArrayLike, width_s: float) -> Array:
         """Return the mean acceleration over cells of `width_s` centred at `time_s`, mm/s^2.
 
-        Exact, by differences of the velocity: sampling the square wave itself would alias.
+        One for each time. Exact, by differences of the velocity: sampling the square wave itself
+        would alias.
         """
         t = np.asarray(time_s, np.float64)
         after = np.interp(t + 0.5 * width_s, self.time_s, self.velocity_mm_s)

@@ -317,9 +317,8 @@ def _pairs_theta(structure: PairStructure, b: Array, a: Array) -> Array | None:
 
 def _grown(data: ResponseData, smaller: _Candidate) -> _Candidate:
     """Add a pair where the residual is largest."""
-    error = np.abs(data.weight * (smaller.model(data.f_hz) - data.response))
-    at = data.f_hz[np.argmax(np.convolve(error, np.ones(5) / 5, mode="same"))]
-    structure, theta = smaller.structure.extended(smaller.theta, float(at))
+    at_hz = data.most_missed_hz(smaller.model(data.f_hz))
+    structure, theta = smaller.structure.extended(smaller.theta, at_hz)
     return ResponseCandidate(structure, np.concatenate([smaller.vector[:2], theta]))
 
 

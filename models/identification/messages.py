@@ -256,7 +256,13 @@ def phase_warning(axis: str, fault: str, notes: Sequence[str]) -> str:
 
 
 def level_warnings(responses: Sequence[FrequencyResponse], fit: Fit) -> list[str]:
-    """Judge the level by the fit, where nothing followed at the frequencies that tell it."""
+    """Judge the level by the fit, where nothing followed at the frequencies that tell it.
+
+    Raises
+    ------
+    ModelError
+        If no sensor on what moves can have shown it.
+    """
     names = ", ".join(r.source for r in responses if plateau_gain(r) is None)
     if not names or abs(fit.gain - 1.0) <= _LEVEL_TOLERANCE:
         return []

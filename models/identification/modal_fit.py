@@ -201,9 +201,8 @@ def _grown(data: ResponseData, plant: RelativeModesSpec, delay_s: float) -> Moda
     """Return a start with one more mode, where the plant misses most."""
     seen = frequency_response(plant, data.f_hz) * np.exp(-2j * np.pi * data.f_hz * delay_s)
     gain = np.vdot(seen, data.response).real / np.vdot(seen, seen).real
-    error = np.abs(data.weight * (gain * seen - data.response))
-    at = float(data.f_hz[np.argmax(np.convolve(error, np.ones(5) / 5, mode="same"))])
-    return of_poles(data, [*((m.f_hz, m.zeta) for m in plant.modes), (at, _START_ZETA)])
+    at_hz = data.most_missed_hz(gain * seen)
+    return of_poles(data, [*((m.f_hz, m.zeta) for m in plant.modes), (at_hz, _START_ZETA)])
 
 
 def of_poles(data: ResponseData, poles: Sequence[tuple[float, float]]) -> Modal | None:

@@ -22,6 +22,8 @@ __all__ = ["PairStructure"]
 # A zero exactly on the imaginary axis would make log G infinite at its frequency.
 _SMALL = 1e-9
 _NO_TAU = 1e-5
+_NEW_ZETA = 0.1
+"""Damping that a new pair begins with."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,12 +77,12 @@ class PairStructure:
             axis=1,
         )
 
-    def extended(self, theta: Array, f_hz: float, zeta: float = 0.1) -> tuple[PairStructure, Array]:
+    def extended(self, theta: Array, f_hz: float) -> tuple[PairStructure, Array]:
         """Return a structure with one more pole pair at `f_hz`, a zero pair near it, and start."""
         tau, log_f, log_z, log_fz, zz = self.split(theta)
         log_new = np.log(f_hz / self.unit_hz)
-        poles = [np.append(log_f, log_new), np.append(log_z, np.log(zeta))]
-        zeros = [np.append(log_fz, log_new + 0.03), np.append(zz, zeta)]
+        poles = [np.append(log_f, log_new), np.append(log_z, np.log(_NEW_ZETA))]
+        zeros = [np.append(log_fz, log_new + 0.03), np.append(zz, _NEW_ZETA)]
         larger = PairStructure(self.poles + 1, self.zeros + 1, self.unit_hz)
         return larger, np.concatenate([[tau], *poles, *zeros])
 

@@ -35,7 +35,10 @@ def predicted_psd(
 
 
 def predicted_spectrum(plant: PlantSpec, excitation: Excitation) -> tuple[Array, Array]:
-    """Return frequencies up to 200 Hz and the density [(mm/s^2)^2/Hz] that the test would show."""
+    """Return frequencies up to 200 Hz and the density that the test would show.
+
+    Shapes (n,); the density in (mm/s^2)^2/Hz.
+    """
     f = np.arange(_BIN_HZ, _F_MAX_HZ, _BIN_HZ)
     power = np.abs(frequency_response(plant, f)) ** 2
     return f, np.asarray(drive_spectrum(excitation, f) * power, np.float64)

@@ -20,6 +20,8 @@ _RELATIVE_FLOOR = 0.02
 """Nonlinearity of a real axis: no point counts as better known than this share of the response
 or, where it has fallen below that, of its value at low frequency."""
 _LEAST_POINTS = 12
+_AROUND = 5
+"""Points over which an error is averaged."""
 _LEAST_RUN = 0.01
 """Share of all points that must be coherent side by side: a few among noise are so by chance."""
 _UNKNOWN_NOISE = 0.005
@@ -56,6 +58,12 @@ class ResponseData:
     def band_hz(self) -> tuple[float, float]:
         """Lowest and highest frequency."""
         return float(self.f_hz[0]), float(self.f_hz[-1])
+
+    def most_missed_hz(self, modelled: Complex) -> float:
+        """Return the frequency around which a model, shape (n,), misses the response most."""
+        error = np.abs(self.weight * (modelled - self.response))
+        around = np.convolve(error, np.ones(_AROUND) / _AROUND, mode="same")
+        return float(self.f_hz[np.argmax(around)])
 
     def thinned(self, points: int) -> ResponseData:
         """Return about `points` of them, evenly."""

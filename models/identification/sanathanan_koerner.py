@@ -13,6 +13,8 @@ from stillpath.models.arrays import Array, Complex
 
 __all__ = ["pairs_of", "polynomial_basis", "sanathanan_koerner"]
 
+_ROUNDS = 15
+
 
 def sanathanan_koerner(
     basis: Complex,
@@ -20,8 +22,6 @@ def sanathanan_koerner(
     weight: Array,
     numerator: int,
     denominator: int,
-    *,
-    rounds: int = 15,
 ) -> tuple[Array, Array, float]:
     """Fit B/A with A = 1 + a_1 x + ... + a_n x^n.
 
@@ -45,7 +45,7 @@ def sanathanan_koerner(
     size = float(np.linalg.norm(weight * response))
     scale = weight.copy()
     best: tuple[Array, Array, float] | None = None
-    for _ in range(rounds):
+    for _ in range(_ROUNDS):
         b, rest = np.split(
             _least_squares(matrix * scale[:, None], response * scale), [numerator + 1]
         )

@@ -277,8 +277,8 @@ def _provenance_of(
     kind: Kind,
     measured: Sequence[FrequencyResponse] = (),
     *,
-    delays_s: tuple[float, float] | None = None,
-    origin: Origin = _UNKNOWN,
+    delays_s: tuple[float, float] | None,
+    origin: Origin,
 ) -> Provenance:
     """Return the provenance that a store keeps with a plant.
 
@@ -286,8 +286,8 @@ def _provenance_of(
     ----------
     measured : sequence of FrequencyResponse
         Responses whose coherence is recorded, if it is known.
-    delays_s : (float, float), optional
-        What the plants that explain the measurement delay slow motion by.
+    delays_s : (float, float) or None
+        What the plants that explain the measurement delay slow motion by, if that is known.
     """
     share, band_hz = coherent_part(measured)
     return Provenance(

@@ -1,6 +1,6 @@
 """Add shaper and acceleration commands to a print file, leaving its moves unchanged.
 
-The sliced file is measured, settings are tried on samples of it, and the choice is written. The
+The sliced file is measured, settings are tried on excerpts of it, and the choice is written. The
 written file is then read and measured by the firmware's rules, with the shaper that its lines set.
 A feature that exceeds its bound there is made slower, and the file is written again.
 """
@@ -15,6 +15,7 @@ from typing import Any, BinaryIO, TypeVar
 
 import numpy as np
 
+from stillpath.compensation.defaults import DT_S
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.interpreter import Interpreter
@@ -49,8 +50,7 @@ from stillpath.pipeline.measuring.reference_shaper import cached_shaper
 from stillpath.pipeline.measuring.set_errors import ClassError, SetErrors
 from stillpath.pipeline.operating_point import Operation
 from stillpath.pipeline.options import Options, stamp
-from stillpath.pipeline.pacing.samples import take_samples
-from stillpath.pipeline.piece_compensator import DT_S
+from stillpath.pipeline.pacing.excerpts import take_excerpts
 from stillpath.pipeline.progress import ProgressCallback, ProgressReports
 from stillpath.pipeline.result import (
     NOTHING_COMPENSATED,
@@ -187,12 +187,12 @@ class _AdvisedFile:
     def _chosen(
         self, names: Sequence[str], was: dict[int, ClassError], reading: FirstReading
     ) -> tuple[Choice, FirstLayer]:
-        """Choose accelerations and shapers on samples of the file."""
+        """Choose accelerations and shapers on excerpts of the file."""
         self._source.seek(0)
-        samples = take_samples(self._source, self._machine, self._dialect)
+        excerpts = take_excerpts(self._source, self._machine, self._dialect)
         errors_um = {f: error.rms_um for f, error in was.items()}
         choice = choose(
-            samples,
+            excerpts,
             AsSliced(names, self._before, errors_um, reading.levels),
             self._machine,
             self._adviser,
@@ -200,7 +200,7 @@ class _AdvisedFile:
             lambda share: self._say("choosing", 0.3 + 0.3 * share),
             shaped=self._shapes(reading),
         )
-        return choice, samples.first_layer
+        return choice, excerpts.first_layer
 
     def _warnings(
         self,

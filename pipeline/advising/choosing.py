@@ -1,4 +1,4 @@
-"""Choose shaper and accelerations on samples from all over a file.
+"""Choose shaper and accelerations on excerpts from all over a file.
 
 Every shaper type of the firmware is tuned for the plants of the set, to the frequencies that
 minimise the worst member's error, with walls weighted as much as everything else. With each, every
@@ -15,6 +15,7 @@ from functools import cache
 
 import numpy as np
 
+from stillpath.compensation.defaults import DT_S
 from stillpath.gcode.firmware.base import Adviser
 from stillpath.gcode.pacing import FirstLayer
 from stillpath.gcode.slicers.features import feature_of
@@ -32,8 +33,7 @@ from stillpath.pipeline.advising.advice import (
 from stillpath.pipeline.advising.trials import Trial
 from stillpath.pipeline.measuring.reference_shaper import FREQUENCIES_HZ, descend
 from stillpath.pipeline.measuring.set_errors import machine_numbers
-from stillpath.pipeline.pacing.samples import FileSamples
-from stillpath.pipeline.piece_compensator import DT_S
+from stillpath.pipeline.pacing.excerpts import FileExcerpts
 
 __all__ = ["AsSliced", "Choice", "choose", "ladder"]
 
@@ -42,7 +42,7 @@ _LOW_MM_S2, _RATIO = 500.0, 1.2
 _LOWEST_MM_S2, _LOW_RATIO = 100.0, 1.5
 """Walls go below `_LOW_MM_S2` only if nothing else brings them within their bound."""
 _AIM = 0.95
-"""Share of a bound that the samples may use."""
+"""Share of a bound that the excerpts may use."""
 _POINTS, _MEMBERS = 1000, 5
 """Points and members used to tune frequencies; the final choice uses all members."""
 _COARSE = 6
@@ -53,7 +53,7 @@ _EITHER += [(-2, -2), (-2, 2), (2, -2), (2, 2)]
 _TUNED_LEVELS = 5
 _MENDING_ROUNDS = 4
 _UNLIKE = 2.0
-"""Largest ratio, either way, assumed between errors in the samples and in the whole file."""
+"""Largest ratio, either way, assumed between errors in the excerpts and in the whole file."""
 _SAME_TIME, _ROUNDING = 0.002, 1.001
 LEVEL_STEP = 0.02
 
@@ -156,7 +156,7 @@ class AsSliced:
 
 
 def choose(
-    samples: FileSamples,
+    excerpts: FileExcerpts,
     sliced: AsSliced,
     machine: Machine,
     adviser: Adviser,
@@ -177,7 +177,7 @@ def choose(
         Whether a shaper may be advised.
     """
     members = machine_numbers(machine, DT_S)
-    as_sliced = Trial(samples, {}, machine, adviser, DT_S, members)
+    as_sliced = Trial(excerpts, {}, machine, adviser, DT_S, members)
     features = [f for f in as_sliced.features if _free(f, sliced.names)]
     visible = {f for f in features if is_visible(sliced.names[f] if f >= 0 else "")}
     was = {f: max(um, 1e-3) for f, um in as_sliced.errors(sliced.shaping).items()}
@@ -189,17 +189,17 @@ def choose(
         ladder(adviser.highest_mm_s2, machine),
         dict.fromkeys(features),
         visible,
-        _own_mm_s2(samples, adviser),
+        _own_mm_s2(excerpts, adviser),
     )
     if not features:
         return choice
     kinds = adviser.shapers if shaped else ()
-    candidates = _candidates(samples, machine, adviser, kinds, sliced, visible, progress)
-    points = [sample.point for sample in samples.samples]
+    candidates = _candidates(excerpts, machine, adviser, kinds, sliced, visible, progress)
+    points = [one.point for one in excerpts.excerpts]
     by_point = [_by_point(c, points, sliced.levels, machine) for c in candidates]
 
     def trial_of(bounds: dict[int, Bound]) -> Trial:
-        return Trial(samples, bounds, machine, adviser, DT_S, members) if bounds else as_sliced
+        return Trial(excerpts, bounds, machine, adviser, DT_S, members) if bounds else as_sliced
 
     every = _try_rungs(trial_of, by_point, limits, choice, progress)
     number, choice.rung = _best(every, limits, choice)
@@ -273,7 +273,7 @@ class _Found:
 
 @dataclass(frozen=True, slots=True)
 class _Limits:
-    """Errors allowed to features in the samples."""
+    """Errors allowed to features in the excerpts."""
 
     bound_um: dict[int, float]
     has_budget: bool
@@ -334,7 +334,7 @@ class _Candidate:
 
 
 def _candidates(
-    samples: FileSamples,
+    excerpts: FileExcerpts,
     machine: Machine,
     adviser: Adviser,
     kinds: Sequence[str],
@@ -352,7 +352,7 @@ def _candidates(
     logs: dict[str, list[tuple[float, float]]] = {kind: [] for kind in kinds}
     for n, level in enumerate(tuned.tolist() if kinds else []):
         point = levels[level][1] if count > 1 else None
-        trial = Trial(samples, {}, machine, adviser, DT_S, few, point=point)
+        trial = Trial(excerpts, {}, machine, adviser, DT_S, few, point=point)
         at = trial.points(_POINTS, sorted(visible))
         for m, kind in enumerate(kinds):
             start = logs[kind][-1] if logs[kind] else None
@@ -381,12 +381,12 @@ def _tuned(
     """Return the frequency indices of X and Y that minimise the worst member's error."""
 
     @cache
-    def answer(member: int, axis: int, number: int) -> np.ndarray:
-        return trial.axis_answer(member, axis, kind, float(FREQUENCIES_HZ[number]), at)
+    def response(member: int, axis: int, number: int) -> np.ndarray:
+        return trial.axis_response(member, axis, kind, float(FREQUENCIES_HZ[number]), at)
 
     @cache
     def rms(i: int, j: int) -> float:
-        return trial.rms([(answer(k, 0, i), answer(k, 1, j)) for k in range(members)], at)
+        return trial.rms([(response(k, 0, i), response(k, 1, j)) for k in range(members)], at)
 
     coarse = range(0, len(FREQUENCIES_HZ), _COARSE)
     if start is not None:
@@ -407,7 +407,7 @@ def _by_point(
     levels: Sequence[tuple[int, OperatingPoint]],
     machine: Machine,
 ) -> Mapping[OperatingPoint, Shaping] | Shaping:
-    """Return the shaper at every sample's operating point."""
+    """Return the shaper at every excerpt's operating point."""
     if len(levels) == 1:
         return candidate.shapings[0]
     grid = OperatingGrid(machine, step=LEVEL_STEP, blend_step=LEVEL_STEP)
@@ -452,10 +452,10 @@ def _quickest(
     return min(eligible, key=key)
 
 
-def _own_mm_s2(samples: FileSamples, adviser: Adviser) -> dict[int, float]:
+def _own_mm_s2(excerpts: FileExcerpts, adviser: Adviser) -> dict[int, float]:
     own: dict[int, float] = {}
-    for sample in samples.samples:
-        moves, limits = sample.piece.moves, sample.piece.limits
+    for one in excerpts.excerpts:
+        moves, limits = one.piece.moves, one.piece.limits
         wanted, file = wanted_accel(moves, limits, Advice(), adviser)
         for feature in np.unique(moves.feature[~np.isnan(wanted)]).tolist():
             rows = (moves.feature == feature) & ~np.isnan(wanted)
@@ -463,11 +463,11 @@ def _own_mm_s2(samples: FileSamples, adviser: Adviser) -> dict[int, float]:
     return own
 
 
-def _bound_um(sampled_um: float, whole_um: float, budget_um: float | None) -> float:
-    """Return a feature's bound for the samples, whose errors differ from the whole file's."""
+def _bound_um(excerpts_um: float, whole_um: float, budget_um: float | None) -> float:
+    """Return a feature's bound for the excerpts, whose errors differ from the whole file's."""
     if budget_um is None:
-        return sampled_um
-    ratio = sampled_um / max(whole_um, 1e-3)
+        return excerpts_um
+    ratio = excerpts_um / max(whole_um, 1e-3)
     return budget_um * min(max(ratio, 1.0 / _UNLIKE), _UNLIKE)
 
 

@@ -25,7 +25,7 @@ from stillpath.models.schedule import OperatingPoint
 from stillpath.models.shaping import AxisShaper, Shaping
 from stillpath.pipeline.advising.advice import Advice, Bound, wanted_accel
 from stillpath.pipeline.measuring.reference_shaper import shaped_at, spread
-from stillpath.pipeline.pacing.samples import FileSamples, Sample
+from stillpath.pipeline.pacing.excerpts import Excerpt, FileExcerpts
 from stillpath.pipeline.shaping import shaped
 from stillpath.simulation.machine_response import MachineStream
 from stillpath.simulation.measures import PathDistances
@@ -39,13 +39,13 @@ _POINTS = 600
 
 @dataclass(frozen=True, slots=True)
 class _Motion:
-    """The motion of all samples, concatenated with rests between them."""
+    """The motion of all excerpts, concatenated with rests between them."""
 
     path_mm: Array
     feature: NDArray[np.int32]
     """-2 where nothing is printed."""
     bounds: list[tuple[int, int, OperatingPoint]]
-    """Range [first, last) of each sample, and its operating point."""
+    """Range [first, last) of each excerpt, and its operating point."""
     seconds: dict[int, float]
     """Duration of each feature; -2: everything else."""
 
@@ -60,7 +60,7 @@ class Trial:
     members : sequence
         Of `pipeline.measuring.set_errors.machine_numbers`.
     point : OperatingPoint, optional
-        Operating point; None: that of each sample.
+        Operating point; None: that of each excerpt.
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ class Trial:
 
     def __init__(
         self,
-        samples: FileSamples,
+        excerpts: FileExcerpts,
         bounds: Mapping[int, Bound],
         machine: Machine,
         adviser: Adviser,
@@ -80,8 +80,8 @@ class Trial:
         *,
         point: OperatingPoint | None = None,
     ) -> None:
-        advice = Advice(bounds, first_layer=samples.first_layer)
-        motion = _motion(samples.samples, advice, machine, adviser, dt_s)
+        advice = Advice(bounds, first_layer=excerpts.first_layer)
+        motion = _motion(excerpts.excerpts, advice, machine, adviser, dt_s)
         self._dt_s = dt_s
         self._path = motion.path_mm
         self._bounds = [(a, b, p if point is None else point) for a, b, p in motion.bounds]
@@ -124,17 +124,17 @@ class Trial:
         """Return contour errors [mm] at chosen samples, shape (members, len(at))."""
         out = np.empty((len(self._members), len(at)))
         if not self._commutes:
-            for row, answer in zip(out, self._answers_to(self._command(shapings)), strict=True):
-                row[:] = self._distance.at(answer[:, at], at)
+            for row, response in zip(out, self._responses_to(self._command(shapings)), strict=True):
+                row[:] = self._distance.at(response[:, at], at)
             return out
-        for row, answer in zip(out, self._answers, strict=True):
+        for row, response in zip(out, self._responses, strict=True):
             y = np.empty((2, len(at)))
             if isinstance(shapings, Shaping):
-                self._shape(answer, shapings, at, y)
+                self._shape(response, shapings, at, y)
             else:
                 for first, last, point in self._bounds:
                     part = slice(*np.searchsorted(at, (first, last)).tolist())
-                    self._shape(answer, shapings[point], at[part], y[:, part])
+                    self._shape(response, shapings[point], at[part], y[:, part])
             row[:] = self._distance.at(y, at)
         return out
 
@@ -151,10 +151,10 @@ class Trial:
                 found.append(every[::step])
         return np.unique(np.concatenate(found)) if found else np.zeros(0, np.int64)
 
-    def axis_answer(self, member: int, axis: int, kind: str, f_hz: float, at: Ints) -> Array:
+    def axis_response(self, member: int, axis: int, kind: str, f_hz: float, at: Ints) -> Array:
         """Return one member's positions of one axis at chosen samples, under one shaper."""
         pulses = AxisShaper(kind, f_hz).pulses()
-        return shaped_at(self._answers[member][axis], self._dt_s, pulses, at)
+        return shaped_at(self._responses[member][axis], self._dt_s, pulses, at)
 
     def rms(self, positions: Sequence[tuple[Array, Array]], at: Ints) -> float:
         """Return the rms contour error [mm] of the worst of several motions."""
@@ -165,7 +165,7 @@ class Trial:
         return float(np.sqrt(worst / max(len(at), 1)))
 
     def _command(self, shapings: Mapping[OperatingPoint, Shaping] | Shaping) -> Array:
-        """Return the shaped plan; every sample of it begins and ends at rest."""
+        """Return the shaped plan; every excerpt of it begins and ends at rest."""
         parts = [np.zeros((2, 0))]
         for first, last, point in self._bounds:
             shaping = shapings if isinstance(shapings, Shaping) else shapings[point]
@@ -173,32 +173,32 @@ class Trial:
         return np.concatenate(parts, axis=1)
 
     @cached_property
-    def _answers(self) -> list[Array]:
-        return list(self._answers_to(self._path))
+    def _responses(self) -> list[Array]:
+        return list(self._responses_to(self._path))
 
-    def _answers_to(self, command_mm: Array) -> Iterator[Array]:
+    def _responses_to(self, command_mm: Array) -> Iterator[Array]:
         """Yield every member's positions; ripple and guides are the same for all of them."""
         received_mm = MachineStream(self._machine, self._dt_s).received_mm(command_mm)
         for member in self._members:
-            yield self._answer(member, received_mm)
+            yield self._response(member, received_mm)
 
-    def _answer(self, member: int | None, received_mm: Array) -> Array:
+    def _response(self, member: int | None, received_mm: Array) -> Array:
         parts = [np.zeros((2, 0))]
         stream: MachineStream | None = None
         for first, last, point in self._bounds:
             if stream is None:
                 stream = MachineStream(self._machine, self._dt_s, point, member=member)
             stream.operate_at(point)
-            parts.append(stream.answer(received_mm[:, first:last], self._path[:, first:last]))
+            parts.append(stream.respond(received_mm[:, first:last], self._path[:, first:last]))
         return np.concatenate(parts, axis=1)
 
-    def _shape(self, answer: Array, shaping: Shaping, at: Ints, out: Array) -> None:
+    def _shape(self, response: Array, shaping: Shaping, at: Ints, out: Array) -> None:
         for axis, shaper in enumerate((shaping.x, shaping.y)):
-            out[axis] = shaped_at(answer[axis], self._dt_s, shaper.pulses(), at)
+            out[axis] = shaped_at(response[axis], self._dt_s, shaper.pulses(), at)
 
 
 def _motion(
-    samples: Sequence[Sample], advice: Advice, machine: Machine, adviser: Adviser, dt_s: float
+    excerpts: Sequence[Excerpt], advice: Advice, machine: Machine, adviser: Adviser, dt_s: float
 ) -> _Motion:
     paths: list[Array] = []
     features: list[NDArray[np.int32]] = []
@@ -206,12 +206,12 @@ def _motion(
     seconds: dict[int, float] = {}
     end, stands_at = 0, np.zeros(2)
     pad = round(_REST_S / dt_s)
-    for sample in samples:
-        phases = _planned(sample, advice, machine, adviser)
+    for excerpt in excerpts:
+        phases = _planned(excerpt, advice, machine, adviser)
         if len(phases) == 0:
             continue
         numbers = phases.move_index - phases.move_index[0]
-        feature = np.where(phases.prints, sample.piece.moves.feature[numbers], -2).astype(np.int32)
+        feature = np.where(phases.prints, excerpt.piece.moves.feature[numbers], -2).astype(np.int32)
         duration = phases.lasts_s
         for one in np.unique(feature).tolist():
             seconds[one] = seconds.get(one, 0.0) + float(np.sum(duration[feature == one]))
@@ -219,21 +219,21 @@ def _motion(
         position, row = sample_phases(phases, (float(phases.t_s[0]), dt_s, round(total_s / dt_s)))
         if position.shape[1] == 0:
             continue
-        # Contour errors do not depend on position; joining the samples excites no vibration.
+        # Contour errors do not depend on position; joining the excerpts excites no vibration.
         path = position[:2] - position[:2, :1] + stands_at[:, None]
         stands_at = path[:, -1]
         paths.append(np.pad(path, ((0, 0), (pad, pad)), mode="edge"))
         features.append(np.pad(feature[row], pad, constant_values=-2))
         first, end = end, end + paths[-1].shape[1]
-        bounds.append((first, end, sample.point))
+        bounds.append((first, end, excerpt.point))
     if not paths:
         return _Motion(np.zeros((2, 0)), np.zeros(0, np.int32), [], seconds)
     return _Motion(np.concatenate(paths, axis=1), np.concatenate(features), bounds, seconds)
 
 
-def _planned(sample: Sample, advice: Advice, machine: Machine, adviser: Adviser) -> Phases:
-    """Plan a sample with the advised accelerations."""
-    piece = sample.piece
+def _planned(excerpt: Excerpt, advice: Advice, machine: Machine, adviser: Adviser) -> Phases:
+    """Plan an excerpt with the advised accelerations."""
+    piece = excerpt.piece
     moves = piece.moves
     wanted, file = wanted_accel(moves, piece.limits, advice, adviser)
     changed = np.flatnonzero(~np.isnan(wanted) & (wanted != file))

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from stillpath.models.machine import Machine
 from stillpath.pipeline.last_check import _reader_kernels as at
+from stillpath.pipeline.last_check.coverage import Coverage
 from stillpath.pipeline.last_check.errors import LastCheckError, shown
 from stillpath.pipeline.last_check.original import ALL, Original, Place, Text, Wanted
 from stillpath.pipeline.last_check.reader import NAN, Kind, Reader, code_of, is_same
@@ -30,7 +31,6 @@ __all__ = ["LastCheck"]
 
 _PLACE_MM, _FILAMENT_MM = 1e-5, 1e-4
 _MOST_IDLE = 1 << 10
-_SHOWN = 5
 _ON, _HELD = b"; stillpath: stream on", b"; stillpath, held back: "
 _OFF = re.compile(rb"; stillpath: stream off(?:, line (\d+) of the original)?\s*$")
 _NAMES = ("x", "y", "z", "the extruder", "filament fed", "F", "", "relative", "relative E")
@@ -93,10 +93,7 @@ class LastCheck:
         self._wanted: Wanted | None = None
         self._earlier: deque[bytes] = deque(maxlen=64)
         """Lines matched to the first of several equal ones, or to ours, perhaps wrongly."""
-        self._kept = self._compared = 0
-        self._gap_line = 0
-        self._gaps: list[str] = []
-        self._more_gaps = 0
+        self._coverage = Coverage(self._before)
         self.cpu_s = 0.0
 
     def write(self, data: bytes) -> int:
@@ -134,15 +131,8 @@ class LastCheck:
             error = self._missing(self._original.text.line, expected)
             error.stream_line = self._stream_line
             raise error
-        if self._gap_line:
-            self._close_gap("the end")
-        gaps = list(self._gaps)
-        if self._more_gaps:
-            gaps.append(f"... and {self._more_gaps} more")
         self.cpu_s += time.process_time() - began
-        return LastCheckFigures(
-            kept_lines=self._kept, compared_lines=self._compared, not_compared=gaps
-        )
+        return self._coverage.figures()
 
     # The written file
 
@@ -189,7 +179,7 @@ class LastCheck:
             code = written.data[max(start, after) : end]
             place = original.line - 1, written.line - 1
             raise self._differs(found, self._before.state, "after", code, *place)
-        self._note(moves, unknown, before, before + known)
+        self._coverage.note(moves, unknown, before, before + known)
         if written.is_read or (lines and original.is_read):
             return
         line, next_at = written.peek()
@@ -341,7 +331,7 @@ class LastCheck:
         if self._wanted is not None and is_same(code, self._wanted.code):
             self._earlier.append(self._wanted.code)
             self._count_anew()
-        self._kept += 1
+        self._coverage.kept += 1
 
     def _came_already(self) -> bool:
         """Continue after the awaited line if it was matched to an earlier one; return whether."""
@@ -350,7 +340,7 @@ class LastCheck:
             return False
         self._earlier.remove(wanted.code)
         self._take(wanted, compared=False)
-        self._kept -= 1
+        self._coverage.kept -= 1
         self._count_anew()
         return True
 
@@ -368,7 +358,7 @@ class LastCheck:
         if compared:
             self._count(wanted.line)
         else:
-            self._kept += 1
+            self._coverage.kept += 1
         # We write such lines too: this one may be ours, and the file's own may still come.
         if not (_IN_STREAM.match(wanted.code) or _SHAPER.search(wanted.code)):
             self._original.perhaps.clear()
@@ -382,7 +372,7 @@ class LastCheck:
         while line := original.harmless():
             if not written.data.startswith(line, written.at):
                 return
-            self._kept += 1
+            self._coverage.kept += 1
             written.skip(written.at + len(line))
             original.text.skip(original.text.at + len(line))
             self._begun.append(original.place())
@@ -407,7 +397,7 @@ class LastCheck:
         original.perhaps.clear()
         while len(self._begun) > 1 and self._begun[-1].line > number:
             self._begun.pop()
-            self._kept -= 1
+            self._coverage.kept -= 1
             original.forget_ahead()
         original.go_to(self._begun[-1])
         original.go_up_to(number)
@@ -439,27 +429,7 @@ class LastCheck:
     def _count(self, line: int) -> None:
         before, after = self._before.state, self._after.state
         unknown = before[at.X] + before[at.Y] + after[at.X] + after[at.Y]
-        self._note(1, int(unknown != unknown), line, line)
-
-    def _note(self, lines: int, unknown: int, line: int, known_line: int) -> None:
-        """Count compared lines from `line` on; the position is known from `known_line` on."""
-        self._kept += lines
-        self._compared += lines - unknown
-        if unknown and not self._gap_line:
-            self._gap_line = line
-        if lines > unknown and self._gap_line:
-            self._close_gap(f"line {known_line}")
-
-    def _close_gap(self, until: str) -> None:
-        line, self._gap_line = self._gap_line, 0
-        why = shown(self._before.lost) or "no line has named one yet"
-        if len(self._gaps) < _SHOWN:
-            self._gaps.append(
-                f"from line {line} up to {until}: filament and modes only, since the position is "
-                f"not known there ({why})"
-            )
-        else:
-            self._more_gaps += 1
+        self._coverage.note(1, int(unknown != unknown), line, line)
 
     def _differs(
         self,

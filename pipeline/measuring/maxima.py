@@ -52,21 +52,21 @@ class Maxima:
         self._index = np.zeros(0, np.int64)
         self._groups = np.zeros((2, 0), np.int64)
         """Number, layer and feature of the samples that are to be measured."""
-        self._fed = self._answered = self._added = 0
+        self._fed = self._responded = self._added = 0
         self.max_mm = np.zeros(channels)
         self.layers: dict[int, Array] = {}
         self.features: dict[int, Array] = {}
         self.jump()
 
     def jump(self) -> None:
-        """Forget the position: all that was added was answered."""
+        """Forget the position: all that was added has had its response."""
         self._note(self._errors.flush())
         self._printed = self._moved = -self._reach - 1
         self._of = (-1, -1)
         self._at: Array | None = None
 
     def add(self, samples: MotionSamples) -> None:
-        """Add motion whose responses follow later (`answered`)."""
+        """Add motion whose responses follow later (`add_responses`)."""
         n, moves = len(samples), samples.moves
         path = samples.path_mm
         marks = np.stack([moves.layer, moves.feature])
@@ -100,17 +100,17 @@ class Maxima:
         self._at = path[:, -1].copy()
         self._added += n
 
-    def answered(self, path_mm: Array, answer_mm: Array) -> None:
+    def add_responses(self, path_mm: Array, response_mm: Array) -> None:
         """Add the next responses, shapes (2, n) and (channels, 2, n), to samples added before."""
-        upto = self._answered + path_mm.shape[1]
+        upto = self._responded + path_mm.shape[1]
         if self._exact is not None:
-            self._choose(path_mm, answer_mm[self._exact], self._exact)
+            self._choose(path_mm, response_mm[self._exact], self._exact)
         end = int(np.searchsorted(self._index, upto))
-        at = self._index[self._fed : end] - self._answered
-        self._answered, self._fed = upto, end
-        self._note(self._errors.push(path_mm, answer_mm, at))
+        at = self._index[self._fed : end] - self._responded
+        self._responded, self._fed = upto, end
+        self._note(self._errors.push(path_mm, response_mm, at))
 
-    def _choose(self, path_mm: Array, answer_mm: Array, channel: int) -> None:
+    def _choose(self, path_mm: Array, response_mm: Array, channel: int) -> None:
         """Add samples whose error may exceed their feature's maximum so far."""
         n = path_mm.shape[1]
         of, self._pending = self._pending[:, :n], self._pending[:, n:]
@@ -118,10 +118,10 @@ class Maxima:
         for feature, max_mm in self.features.items():
             most_mm[feature + 1] = max_mm[channel]
         chosen = np.empty(n, np.int64)
-        at = chosen[: above(path_mm, answer_mm, of[1], most_mm, chosen)]
+        at = chosen[: above(path_mm, response_mm, of[1], most_mm, chosen)]
         if len(at) == 0:
             return
-        index = np.append(self._index, self._answered + at)
+        index = np.append(self._index, self._responded + at)
         order = np.argsort(index, kind="stable")
         self._index = index[order]
         self._groups = np.append(self._groups, of[:, at], axis=1)[:, order]

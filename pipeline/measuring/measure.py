@@ -20,13 +20,13 @@ from stillpath.models.machine import Machine
 from stillpath.models.schedule import OperatingPoint
 from stillpath.pipeline.band import BandContent
 from stillpath.pipeline.measuring.earlier import EarlierErrors
+from stillpath.pipeline.measuring.excerpts import MotionExcerpts
 from stillpath.pipeline.measuring.layer_views import LayerViews
 from stillpath.pipeline.measuring.layers import LayerRecorder, LayerTile
 from stillpath.pipeline.measuring.maxima import RINGING_S, Maxima
 from stillpath.pipeline.measuring.points import MeasuredPoints, MotionSamples
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.pipeline.measuring.responses import Responses, ResponseSamples
-from stillpath.pipeline.measuring.sample import MotionSample
 from stillpath.pipeline.measuring.spectra import ErrorSpectra
 from stillpath.pipeline.measuring.tracing import Trace, Tracer
 from stillpath.pipeline.result import (
@@ -75,7 +75,7 @@ class Measurement:
 
     Attributes
     ----------
-    sample : MotionSample
+    excerpts : MotionExcerpts
         Some of the motion, for the range of its errors.
     """
 
@@ -105,7 +105,7 @@ class Measurement:
         self._layers, self._features = (GroupTally(len(names)) for _ in range(2))
         exact = names.index("after") if self._stride > 1 and compensated else None
         self._maxima = Maxima(dt_s, len(names), exact)
-        self._answers = Responses(machine, dt_s, shaper, names)
+        self._responses = Responses(machine, dt_s, shaper, names)
         self._shaper_label = f"best shaper ({shaper.label})"
         self._track = _Bins(len(shown))
         self._spectra = ErrorSpectra(machine, dt_s, names)
@@ -116,17 +116,17 @@ class Measurement:
         self._waiting: list[MeasuredPoints] = []
         self._jumped = True
         self._last: MotionSamples | None = None
-        self.sample = MotionSample(dt_s)
+        self.excerpts = MotionExcerpts(dt_s)
 
     def operate_at(self, point: OperatingPoint) -> None:
         """Set the operating point of the motion that follows."""
-        self._answers.operate_at(point)
+        self._responses.operate_at(point)
 
     def add(self, samples: MotionSamples) -> None:
         """Add motion."""
         if len(samples):
             self._last = samples
-            self.sample.add(samples)
+            self.excerpts.add(samples)
             which = slice(-self._count % self._stride, None, self._stride)
             points = MeasuredPoints.of(samples, which, jumped=self._jumped)
             if len(points):
@@ -135,7 +135,7 @@ class Measurement:
             self._count += len(samples)
             self._band.add(samples.path_mm, samples.extruding)
             self._maxima.add(samples)
-            self._measure(self._answers.push(samples))
+            self._measure(self._responses.push(samples))
 
     def stand(self, samples: int) -> Array | None:
         """Stand still; return the position for every sample, (2, n), if known."""
@@ -147,7 +147,7 @@ class Measurement:
 
     def jump(self) -> None:
         """Forget the position: the machine stands still when motion resumes."""
-        self._measure(self._answers.flush())
+        self._measure(self._responses.flush())
         self._note(self._meter.flush())
         self._band.jump()
         self._maxima.jump()
@@ -158,7 +158,7 @@ class Measurement:
     def finish(self) -> None:
         """Finish: let the machine ring out at the end of the motion."""
         self.stand(round(RINGING_S / self._dt_s))
-        self._measure(self._answers.flush())
+        self._measure(self._responses.flush())
         self._note(self._meter.flush())
         self._maxima.finish()
         self._tiles.finish()
@@ -166,12 +166,12 @@ class Measurement:
     def _measure(self, found: ResponseSamples | None) -> None:
         if found is None:
             return
-        path_mm, answer_mm, extruding = found.path_mm, found.answer_mm, found.extruding
-        self._spectra.add(path_mm, answer_mm, extruding)
-        self._maxima.answered(path_mm, answer_mm)
+        path_mm, response_mm, extruding = found.path_mm, found.response_mm, found.extruding
+        self._spectra.add(path_mm, response_mm, extruding)
+        self._maxima.add_responses(path_mm, response_mm)
         if self._tracer is not None:
-            self._tracer.wait(found.executed_mm, answer_mm)
-        self._note(self._meter.push(path_mm, answer_mm, extruding))
+            self._tracer.wait(found.executed_mm, response_mm)
+        self._note(self._meter.push(path_mm, response_mm, extruding))
 
     def _note(self, errors: ContourErrors) -> None:
         done = 0

@@ -239,7 +239,7 @@ class _Trial:
         self._y_d, use = _with_rests(y_d_mm, use, dt_s)
         self._dt_s = dt_s
         self._distances = PathDistances(self._y_d, dt_s)
-        self._answer = response(_plants(machine, dt_s), self._y_d)
+        self._response = response(_plants(machine, dt_s), self._y_d)
         self._chosen = np.flatnonzero(use).astype(np.int64)
         self._points: dict[int, Ints] = {}
         self._shaped: dict[tuple[int, str, int, int], Array] = {}
@@ -268,7 +268,7 @@ class _Trial:
         if key not in self._shaped:
             pulses = shaper_pulses(kind, float(FREQUENCIES_HZ[number]), _ZETA)
             points = self._points[count]
-            self._shaped[key] = shaped_at(self._answer[axis], self._dt_s, pulses, points)
+            self._shaped[key] = shaped_at(self._response[axis], self._dt_s, pulses, points)
         return self._shaped[key]
 
 
@@ -279,25 +279,25 @@ def spread(samples: Ints, count: int) -> Ints:
     return np.asarray(samples[np.arange(len(offset)) * step + offset])
 
 
-def shaped_at(answer: Array, dt_s: float, pulses: tuple[Array, Array], index: Ints) -> Array:
-    """Return `shape(answer)[index]`: the response of a plant to a shaped command.
+def shaped_at(unshaped: Array, dt_s: float, pulses: tuple[Array, Array], index: Ints) -> Array:
+    """Return `shape(unshaped)[index]`: the response of a plant to a shaped command.
 
     Parameters
     ----------
-    answer : ndarray, shape (n,)
+    unshaped : ndarray, shape (n,)
         Response of the plant to the plan.
     index : ndarray of int64, shape (m,)
     """
     weights, delays = pulses
     shift = float(weights @ delays)
-    last = len(answer) - 1
+    last = len(unshaped) - 1
     out = np.zeros(len(index))
     for weight, delay in zip(weights, delays, strict=True):
         late = (delay - shift) / dt_s
         whole = math.floor(late)
         part = late - whole
-        out += weight * (1 - part) * answer[np.clip(index - whole, 0, last)]
-        out += weight * part * answer[np.clip(index - whole - 1, 0, last)]
+        out += weight * (1 - part) * unshaped[np.clip(index - whole, 0, last)]
+        out += weight * part * unshaped[np.clip(index - whole - 1, 0, last)]
     return out
 
 

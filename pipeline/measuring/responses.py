@@ -32,14 +32,14 @@ class ResponseSamples:
     ----------
     path_mm, executed_mm : ndarray, shape (2, n)
     extruding : ndarray of bool, shape (n,)
-    answer_mm : ndarray, shape (channels, 2, n)
+    response_mm : ndarray, shape (channels, 2, n)
         View of a larger array.
     """
 
     path_mm: Array
     executed_mm: Array
     extruding: NDArray[np.bool_]
-    answer_mm: Array
+    response_mm: Array
 
 
 class Responses:
@@ -70,12 +70,12 @@ class Responses:
         self._least = 1 if machine.schedules else _LEAST_SAMPLES
         # A linear machine's response to a shaped path is its shaped response to the path.
         linear = not (machine.schedules or machine.ripple or any(machine.friction_mm))
-        self._shapes_answer = linear and self._compensated and {"before", "shaper"} <= set(names)
+        self._shapes_response = linear and self._compensated and {"before", "shaper"} <= set(names)
         self._streams: dict[str, MachineStream] = {}
         self._planned, self._executed = np.zeros((2, 0)), np.zeros((2, 0))
         """Planned: the path, followed by the rows of the sliced file where they differ."""
         self._extruding = np.zeros(0, bool)
-        self._answer = np.zeros((2, 0))
+        self._response = np.zeros((2, 0))
         """Response to the path, from `reach` samples before the held motion as far as known."""
 
     def operate_at(self, point: OperatingPoint) -> None:
@@ -92,7 +92,7 @@ class Responses:
         if self._planned.shape[1] == 0:
             # Before, the machine stood where the motion begins.
             self._planned = np.repeat(fresh[:, :1], self._reach, axis=1)
-            self._answer = self._planned[-2:]
+            self._response = self._planned[-2:]
             self._stand()
         self._planned = np.concatenate([self._planned, fresh], axis=1)
         self._executed = np.concatenate([self._executed, samples.executed_mm], axis=1)
@@ -117,7 +117,7 @@ class Responses:
             self._streams = {
                 name: MachineStream(self._machine, self._dt_s, self._point)
                 for name in self._names
-                if name != "shaper" or not self._shapes_answer
+                if name != "shaper" or not self._shapes_response
             }
 
     def _release(self, ready: int) -> ResponseSamples:
@@ -125,25 +125,25 @@ class Responses:
         span = slice(self._reach, self._reach + ready)
         sliced = self._planned[-2:]
         path, executed = self._planned[:2, span], self._executed[:, :ready]
-        answers = np.empty((len(self._names), *sliced.shape))
-        for name, answer in zip(self._names, answers, strict=True):
-            if name == "before" and self._shapes_answer:
-                known = self._answer.shape[1]
-                answer[:, :known] = self._answer
-                self._streams[name].push(sliced[:, known:], sliced[:, known:], answer[:, known:])
-                self._answer = answer
-            elif name == "shaper" and self._shapes_answer:
-                self._shape(self._answer, answer)
+        responses = np.empty((len(self._names), *sliced.shape))
+        for name, response in zip(self._names, responses, strict=True):
+            if name == "before" and self._shapes_response:
+                known = self._response.shape[1]
+                response[:, :known] = self._response
+                self._streams[name].push(sliced[:, known:], sliced[:, known:], response[:, known:])
+                self._response = response
+            elif name == "shaper" and self._shapes_response:
+                self._shape(self._response, response)
             elif name == "shaper":
                 command = np.empty(sliced.shape)
                 self._shape(sliced, command)
-                self._streams[name].push(command[:, span], path, answer[:, span])
+                self._streams[name].push(command[:, span], path, response[:, span])
             else:
                 came = name == "before" and self._compensated
                 command = sliced[:, span] if came else executed
-                self._streams[name].push(command, path, answer[:, span])
-        out = ResponseSamples(path, executed, self._extruding[:ready], answers[:, :, span])
-        self._planned, self._answer = self._planned[:, ready:], self._answer[:, ready:].copy()
+                self._streams[name].push(command, path, response[:, span])
+        out = ResponseSamples(path, executed, self._extruding[:ready], responses[:, :, span])
+        self._planned, self._response = self._planned[:, ready:], self._response[:, ready:].copy()
         self._executed, self._extruding = self._executed[:, ready:], self._extruding[ready:]
         return out
 

@@ -145,8 +145,8 @@ class SetErrors:
         self._count += n
         # Ripple and guides are the same for all of them.
         received_mm = self._streams[0].received_mm(command_mm)
-        answers = np.stack([stream.answer(received_mm, path_mm) for stream in self._streams])
-        self._note(self._meter.push(path_mm, answers))
+        responses_mm = np.stack([stream.respond(received_mm, path_mm) for stream in self._streams])
+        self._note(self._meter.push(path_mm, responses_mm))
 
     def finish(self) -> None:
         """Finish: the motion has ended."""

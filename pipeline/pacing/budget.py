@@ -1,6 +1,6 @@
 """Choose and control the speed of every class of moves within a budget of contour error.
 
-The paces of classes of moves (features, travel) are chosen on samples from all over the file
+The paces of classes of moves (features, travel) are chosen on excerpts from all over the file
 (`pace_search`), compensated and planned as they will be, and judged by the worst plant of the
 machine's set. While the file is written its errors are measured in the same way, and paces are
 corrected up and down. A file that still exceeds its budget is written again with lower paces, and
@@ -32,9 +32,9 @@ from stillpath.models.machine import CommandLimits, Machine
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.pipeline.measuring.set_errors import WHOLE, ErrorSum, whole
 from stillpath.pipeline.options import LEAST_BUDGET_UM, Options
+from stillpath.pipeline.pacing.excerpts import Excerpt, FileExcerpts
 from stillpath.pipeline.pacing.pace_search import PaceChoice, allowed_um, search
 from stillpath.pipeline.pacing.pace_trials import Factors, PaceTrials, compensated, paces, shaped
-from stillpath.pipeline.pacing.samples import FileSamples, Sample
 from stillpath.pipeline.result import BudgetClass, BudgetFigures
 
 __all__ = ["SpeedBudget"]
@@ -48,7 +48,7 @@ _HELPLESS = 0.99
 """Above this, other classes slow down for one that is already at its own pace."""
 _SLOWER, _FASTER = 0.9, 1.08
 _FURTHEST = 2.0
-"""Highest pace while writing, relative to the one chosen on samples."""
+"""Highest pace while writing, relative to the one chosen on excerpts."""
 _GENTLER = (1.0, 0.6, 0.3)
 """Exponents applied in turn to a piece's factors where no command can follow it."""
 _SURE_S = 5.0
@@ -61,7 +61,7 @@ _MILDER, _POWER = 0.9, 0.5
 
 @dataclass(slots=True)
 class SpeedBudget:
-    """The paces of a file, chosen on samples and corrected as it is written.
+    """The paces of a file, chosen on excerpts and corrected as it is written.
 
     Attributes
     ----------
@@ -101,7 +101,7 @@ class SpeedBudget:
     @classmethod
     def chosen(
         cls,
-        found: FileSamples,
+        found: FileExcerpts,
         machine: Machine,
         options: Options,
         shaper: BestShaper,
@@ -120,9 +120,9 @@ class SpeedBudget:
             The method cannot be designed for this machine.
         """
         assert options.budget_um is not None
-        tops = _tops(found.samples, machine)
-        ours = PaceTrials(found.samples, machine, compensated(machine, options, shaper, caution))
-        theirs = PaceTrials(found.samples, machine, shaped(shaper))
+        tops = _tops(found.excerpts, machine)
+        ours = PaceTrials(found.excerpts, machine, compensated(machine, options, shaper, caution))
+        theirs = PaceTrials(found.excerpts, machine, shaped(shaper))
         return cls(
             machine,
             options.budget_um,
@@ -239,7 +239,7 @@ class SpeedBudget:
         return replace(self)
 
     def _keeps_budget(self, one: int) -> bool:
-        """Return whether a class kept the budget at its own pace in the samples."""
+        """Return whether a class kept the budget at its own pace in the excerpts."""
         return self.paces.bounds_um[one] <= allowed_um(one, self.budget_um)
 
     def _mean_factor(self, one: int) -> float:
@@ -324,14 +324,14 @@ class SpeedBudget:
         return [warning]
 
 
-def _tops(samples: list[Sample], machine: Machine) -> Factors:
+def _tops(excerpts: list[Excerpt], machine: Machine) -> Factors:
     """Return the highest pace of every class, at which its slowest moves reach the limits."""
     most = top_limits(machine)
     tops: Factors = {}
-    for sample in samples:
-        phases = sample.piece.phases
-        for one in np.unique(sample.classes[sample.classes != AS_SLICED]).tolist():
-            rows = sample.classes == one
+    for excerpt in excerpts:
+        phases = excerpt.piece.phases
+        for one in np.unique(excerpt.classes[excerpt.classes != AS_SLICED]).tolist():
+            rows = excerpt.classes == one
             ratio = most.accel_mm_s2 / float(np.min(phases.accel_mm_s2[rows]))
             tops[one] = max(tops.get(one, 1.0), ratio)
     return tops

@@ -1,4 +1,4 @@
-"""Search, on samples, for the fastest paces within a budget of contour error.
+"""Search, on excerpts, for the fastest paces within a budget of contour error.
 
 All classes are raised together, each as far as its own error leaves room. If that was too much,
 those above the budget come down until all keep it, and from there all are raised again. Classes

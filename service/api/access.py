@@ -19,7 +19,7 @@ from fastapi.security import APIKeyHeader, HTTPAuthorizationCredentials, HTTPBea
 from stillpath.service.api.body_timeout import body_timeout_of
 from stillpath.service.api.limits import CallerLimits, name_of
 from stillpath.service.api.problems import NO_KEY, Problem
-from stillpath.service.database.engine import DatabaseAway
+from stillpath.service.database.errors import DatabaseAway
 from stillpath.service.security.audit import AuditLog
 from stillpath.service.security.callers import LOCAL, Caller, Scope
 from stillpath.service.security.keys import Key, KeyStore

@@ -11,7 +11,7 @@ from starlette.concurrency import run_in_threadpool
 
 from stillpath.service.api.problems import Problem, not_ready, responses
 from stillpath.service.api.schemas import Health
-from stillpath.service.database.engine import StoreError
+from stillpath.service.database.errors import StoreError
 from stillpath.service.jobs.store import JobStore
 from stillpath.service.storage.base import Storage, StorageError
 from stillpath.service.storage.disk import Disk

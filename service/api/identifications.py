@@ -17,7 +17,7 @@ from stillpath.applications.identification.figures import IdentificationReport
 from stillpath.applications.machines.resolve import Resolver
 from stillpath.applications.machines.revision import Revision, identified_from
 from stillpath.models.complaints import explain
-from stillpath.models.identification.readers.settings import ReadSettings
+from stillpath.models.identification.readers import LARGEST_BYTES, ReadSettings
 from stillpath.models.machine import Machine
 from stillpath.service.api.access import Reader, Uploader
 from stillpath.service.api.computing import WAITING, ComputeRequest, read_result, run_and_wait
@@ -36,7 +36,6 @@ __all__ = ["router"]
 
 router = APIRouter(prefix="/v1/machines/{name}", tags=["machines"])
 
-_LARGEST_BYTES = 200_000_000
 _MOST_FILES = 40
 _OF_DIRECTIONS = "=,"
 """In names of Klipper's tests of belts: resonances_axis=1.000,-1.000_a.csv."""
@@ -269,7 +268,7 @@ async def _received(request: Request, folder: Path, disk: Disk) -> list[Received
             "Send the files as multipart/form-data (curl -F file=@raw_data_x.csv).",
         )
     files = await receive_files(
-        request, folder, max_bytes=_LARGEST_BYTES, max_files=_MOST_FILES, disk=disk
+        request, folder, max_bytes=LARGEST_BYTES, max_files=_MOST_FILES, disk=disk
     )
     if not files:
         raise Problem(

@@ -25,7 +25,7 @@ from stillpath.pipeline.files import result_name
 from stillpath.service.api.problems import Problem
 from stillpath.service.api.schemas import JobQuery
 from stillpath.service.api.uploads import Upload, receive_upload
-from stillpath.service.database.engine import DatabaseAway
+from stillpath.service.database.errors import DatabaseAway
 from stillpath.service.deliveries.checking import Checker
 from stillpath.service.deliveries.printers import Printer, printer_for
 from stillpath.service.deliveries.targets import TargetRefused, check_webhook

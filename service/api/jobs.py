@@ -17,7 +17,7 @@ from stillpath.service.api.intake import Intake
 from stillpath.service.api.job_lookup import JobId, find, no_such_job
 from stillpath.service.api.problems import Problem, responses
 from stillpath.service.api.schemas import DeliveryView, JobPage, JobQuery, JobView
-from stillpath.service.database.engine import DatabaseAway, DatabaseFull
+from stillpath.service.database.errors import DatabaseAway, DatabaseFull
 from stillpath.service.deliveries.sender import Sender
 from stillpath.service.jobs.state import Cancelled, Job, JobKind, JobState
 from stillpath.service.jobs.store import BadCursor, JobStore

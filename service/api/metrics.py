@@ -17,7 +17,7 @@ from starlette.responses import Response
 
 from stillpath.service.api.access import Operator
 from stillpath.service.api.problems import responses
-from stillpath.service.database.engine import StoreError
+from stillpath.service.database.errors import StoreError
 
 if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send

@@ -17,7 +17,7 @@ from starlette.responses import Response
 from starlette.routing import Match
 
 from stillpath.models.complaints import complaint
-from stillpath.service.database.engine import DatabaseAway, DatabaseFull
+from stillpath.service.database.errors import DatabaseAway, DatabaseFull
 from stillpath.service.jobs.problems import PROBLEM_MEDIA_TYPE, problem, problem_of
 from stillpath.service.storage.base import StorageError
 from stillpath.service.storage.disk import DISK_FULL, NoRoom

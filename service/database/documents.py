@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 from sqlalchemy import ColumnElement, Connection, Engine, func, select, text, update
 
 from stillpath.applications.machines.documents import DocumentFolder, Documents
-from stillpath.service.database.engine import database_url, insert, reading, writing
+from stillpath.service.database.engine import database_url
 from stillpath.service.database.tables import documents
+from stillpath.service.database.transactions import insert, reading, writing
 
 if TYPE_CHECKING:
     from stillpath.service.settings import Settings

@@ -1,74 +1,37 @@
-"""Open the database, migrate its schema, and report clearly if it is unavailable.
-
-``writing`` and ``reading`` are the two kinds of access: one transaction per `with` block.
-"""
+"""Open the database, and migrate its schema."""
 
 from __future__ import annotations
 
 import sqlite3
-import threading
 import time
-from collections import deque
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any
 
 from sqlalchemy import Connection, Engine, create_engine, event, func, inspect, select, text
 from sqlalchemy.engine import URL, make_url
-from sqlalchemy.exc import (
-    ArgumentError,
-    DatabaseError,
-    DBAPIError,
-    InterfaceError,
-    InternalError,
-    OperationalError,
-)
-from sqlalchemy.exc import TimeoutError as PoolTimeout
+from sqlalchemy.exc import ArgumentError, DBAPIError
 from sqlalchemy.pool import NullPool
 
+from stillpath.service.database.errors import DatabaseAway, StoreError, reason, shown
 from stillpath.service.database.migrations import LATEST
+from stillpath.service.database.transactions import BUSY_TIMEOUT_MS, reading, writing
 from stillpath.service.instance_lock import is_half_restored
 from stillpath.service.permissions import private_file, private_folder
 from stillpath.service.storage.base import StorageError
-from stillpath.service.storage.disk import refuses_more
 
 if TYPE_CHECKING:
-    from sqlalchemy import Table
-
     from stillpath.service.settings import Settings
 
-_T = TypeVar("_T")
-
-__all__ = [
-    "SQLITE_FILE",
-    "DatabaseAway",
-    "DatabaseFull",
-    "StoreError",
-    "database_url",
-    "insert",
-    "make_engine",
-    "migrate",
-    "open_database",
-    "reading",
-    "write_together",
-    "writing",
-]
+__all__ = ["SQLITE_FILE", "database_url", "make_engine", "migrate", "open_database"]
 
 SQLITE_FILE = "stillpath.sqlite3"
 """In the data directory."""
-_BUSY_TIMEOUT_MS = 30_000
 _AGAIN_S = 0.02
 _OPENED = "stillpath_opened"
-_WRITER = threading.Lock()
-_WRITE_QUEUE: deque[_PendingWrite] = deque()
-"""Pending writes of `write_together`."""
 # Advisory lock for schema changes; a number not used otherwise in the database.
 _MIGRATION_LOCK = 0x57111_0000
-_READ_ONLY = "25006"
-"""PostgreSQL's code of a server that takes no writes: a standby, or one whose disk is full."""
-_IOERR = (sqlite3.SQLITE_IOERR_WRITE, sqlite3.SQLITE_IOERR_FSYNC, sqlite3.SQLITE_IOERR_SHMSIZE)
 _ON_POSTGRESQL: dict[str, Any] = {
     # A pooler such as PgBouncer may run the next statement on another connection to the server.
     "prepare_threshold": None,
@@ -79,20 +42,6 @@ _ON_POSTGRESQL: dict[str, Any] = {
     "keepalives_count": 3,
     "tcp_user_timeout": 10_000,
 }
-
-
-class StoreError(RuntimeError):
-    """The database cannot be used; the message says what to do."""
-
-    exit_code = 1
-
-
-class DatabaseAway(StoreError):
-    """The database does not respond, or not in time; a retry may help."""
-
-
-class DatabaseFull(DatabaseAway):
-    """There is no space for the database to write."""
 
 
 def database_url(settings: Settings) -> URL:
@@ -149,7 +98,7 @@ def open_database(settings: Settings, *, pooled: bool = True) -> Engine:
     except DBAPIError as error:
         engine.dispose()
         raise StoreError(
-            f"the database {_shown(engine)} cannot be opened: {_reason(error)}; "
+            f"the database {shown(engine)} cannot be opened: {reason(error)}; "
             "check STILLPATH_DATABASE_URL and STILLPATH_DATA_DIR, or restore a backup"
         ) from error
     except BaseException:
@@ -209,7 +158,7 @@ def migrate(engine: Engine, *, before_making: Callable[[], None] = lambda: None)
         known = {script.revision for script in ScriptDirectory.from_config(config).walk_revisions()}
         if version is not None and version not in known:
             raise StoreError(
-                f"the database {_shown(engine)} has schema {version}, this version knows up to "
+                f"the database {shown(engine)} has schema {version}, this version knows up to "
                 f"{LATEST}: a newer Stillpath wrote it; install that one, or restore a backup from "
                 "before"
             )
@@ -266,177 +215,9 @@ def _make_schema(connection: Connection) -> None:
     connection.execute(text("INSERT INTO alembic_version VALUES (:it)"), {"it": LATEST})
 
 
-@contextmanager
-def writing(engine: Engine) -> Iterator[Connection]:
-    """Yield a connection for one transaction, which is rolled back if the block raises.
-
-    Raises
-    ------
-    DatabaseAway
-    """
-    with _write_lock(engine), _translate_errors(engine), engine.begin() as connection:
-        yield connection
-
-
-def write_together(engine: Engine, work: Callable[[Connection], _T]) -> _T:
-    """Return what `work` returns, done in a transaction that others may share (group commit).
-
-    SQLite serialises writes, and each waits for the disk. So the first thread also executes the
-    pending work of all others, each rolled back separately if it raises, and waits for the disk
-    once. On PostgreSQL every call has its own transaction.
-
-    Raises
-    ------
-    DatabaseAway
-        Then nothing may have been written, or all.
-    """
-    if engine.dialect.name != "sqlite":
-        with writing(engine) as connection:
-            return work(connection)
-    mine = _PendingWrite(engine, work)
-    _WRITE_QUEUE.append(mine)
-    try:
-        with _write_lock(engine):
-            if not mine.over.is_set():
-                _commit_group(engine)
-    except DatabaseAway:
-        if _dequeue(mine):
-            raise
-        mine.over.wait()  # another thread is executing it: wait for the outcome
-    finally:
-        _dequeue(mine)
-    if mine.error is not None:
-        raise mine.error
-    return cast("_T", mine.result)
-
-
-@contextmanager
-def reading(engine: Engine) -> Iterator[Connection]:
-    """Yield a connection for reading; writers do not wait for it.
-
-    Raises
-    ------
-    DatabaseAway
-    """
-    with (
-        _translate_errors(engine),
-        engine.execution_options(stillpath_reading=True).begin() as connection,
-    ):
-        yield connection
-
-
-def insert(connection: Connection, table: Table) -> Any:
-    """Return an INSERT that knows ``on_conflict_do_nothing`` and ``on_conflict_do_update``."""
-    # Import only one of them: SQLAlchemy's PostgreSQL dialects load slowly.
-    if connection.dialect.name == "postgresql":
-        from sqlalchemy.dialects import postgresql
-
-        return postgresql.insert(table)
-    from sqlalchemy.dialects import sqlite
-
-    return sqlite.insert(table)
-
-
-@dataclass(eq=False, slots=True)
-class _PendingWrite:
-    """The pending write of a thread, and its outcome."""
-
-    engine: Engine
-    work: Callable[[Connection], Any]
-    over: threading.Event = field(default_factory=threading.Event)
-    result: Any = None
-    error: BaseException | None = None
-
-    def run(self, connection: Connection) -> None:
-        try:
-            with _translate_errors(self.engine), connection.begin_nested():
-                self.result = self.work(connection)
-        except Exception as error:  # belongs to its owner, not to the executing thread
-            self.error = error
-            if not _is_open(connection):
-                raise  # SQLite has undone the others' as well
-
-
-def _dequeue(write: _PendingWrite) -> bool:
-    """Remove a write from the queue; False if it was already taken."""
-    try:
-        _WRITE_QUEUE.remove(write)
-    except ValueError:
-        return False
-    return True
-
-
-def _is_open(connection: Connection) -> bool:
-    """Return whether SQLite's transaction is; it ends one by itself when the disk is full."""
-    driver: Any = connection.connection.dbapi_connection
-    return bool(driver.in_transaction)
-
-
-def _commit_group(engine: Engine) -> None:
-    # Skip writes that their owners are withdrawing.
-    pending = [write for write in _WRITE_QUEUE.copy() if write.engine is engine and _dequeue(write)]
-    try:
-        with _translate_errors(engine), engine.begin() as connection:
-            for write in pending:
-                write.run(connection)
-    except BaseException as error:
-        for write in pending:
-            write.error = error
-        if not isinstance(error, Exception):
-            raise
-    finally:
-        for write in pending:
-            write.over.set()
-
-
-@contextmanager
-def _write_lock(engine: Engine) -> Iterator[None]:
-    """Queue the writers of this process fairly: SQLite's own waiting starves some."""
-    if engine.dialect.name != "sqlite":
-        yield
-        return
-    if not _WRITER.acquire(timeout=_BUSY_TIMEOUT_MS / 1000):
-        raise DatabaseAway(
-            f"the database {_shown(engine)} is not free after {_BUSY_TIMEOUT_MS / 1000:g} s; "
-            "see whether its disk still answers"
-        )
-    try:
-        yield
-    finally:
-        _WRITER.release()
-
-
-@contextmanager
-def _translate_errors(engine: Engine) -> Iterator[None]:
-    try:
-        yield
-    except (OperationalError, InterfaceError, InternalError, PoolTimeout) as error:
-        original = getattr(error, "orig", None)
-        if isinstance(error, InternalError) and getattr(original, "sqlstate", None) != _READ_ONLY:
-            raise  # a bug of ours
-        code, file = getattr(original, "sqlite_errorcode", 0), Path(engine.url.database or "")
-        # An exceeded quota is to SQLite an error like any other.
-        beyond = code in _IOERR and refuses_more(file.parent)
-        if code == sqlite3.SQLITE_FULL or beyond:
-            raise DatabaseFull(
-                f"the disk of the database {_shown(engine)}, or a quota on it, is full; make room"
-            ) from error
-        raise DatabaseAway(
-            f"the database {_shown(engine)} does not answer: {_reason(error)}; see whether it runs "
-            "and has space left"
-        ) from error
-    except DatabaseError as error:
-        if type(error) is not DatabaseError:
-            raise  # a bug of ours
-        raise DatabaseAway(
-            f"the database {_shown(engine)} cannot be read: {_reason(error)}; check "
-            "STILLPATH_DATABASE_URL and STILLPATH_DATA_DIR, or restore a backup"
-        ) from error
-
-
 def _prepare_sqlite(connection: Any, record: Any) -> None:
     connection.isolation_level = None  # BEGIN is ours, below
-    connection.execute(f"PRAGMA busy_timeout = {_BUSY_TIMEOUT_MS}").close()
+    connection.execute(f"PRAGMA busy_timeout = {BUSY_TIMEOUT_MS}").close()
     _use_write_ahead_log(connection)
     for pragma in ("synchronous = FULL", "foreign_keys = ON"):
         connection.execute(f"PRAGMA {pragma}").close()
@@ -458,7 +239,7 @@ def _identity(name: str) -> tuple[int, int] | None:
 def _use_write_ahead_log(connection: Any) -> None:
     # The first connection of all changes the file, and while others open it SQLite refuses at once
     # instead of waiting for them, whatever the timeout says.
-    until = time.monotonic() + _BUSY_TIMEOUT_MS / 1000
+    until = time.monotonic() + BUSY_TIMEOUT_MS / 1000
     while True:
         try:
             connection.execute("PRAGMA journal_mode = WAL").close()
@@ -477,7 +258,7 @@ def _begin_sqlite(connection: Connection) -> None:
     if _identity(name) != opened:
         # SQLite would go on in the deleted file, and what is accepted there is lost.
         raise DatabaseAway(
-            f"the database {_shown(connection.engine)} was deleted or replaced while the service "
+            f"the database {shown(connection.engine)} was deleted or replaced while the service "
             "ran; put it back if need be, and start the service again"
         )
     is_reading = connection.get_execution_options().get("stillpath_reading", False)
@@ -488,12 +269,3 @@ def _version(connection: Connection) -> str | None:
     if not inspect(connection).has_table("alembic_version"):
         return None
     return connection.execute(text("SELECT version_num FROM alembic_version")).scalar()
-
-
-def _shown(engine: Engine) -> str:
-    return engine.url.render_as_string(hide_password=True)
-
-
-def _reason(error: Exception) -> str:
-    original = getattr(error, "orig", None) or error
-    return " ".join(str(original).split())

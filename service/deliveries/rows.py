@@ -20,8 +20,8 @@ from typing import Any
 
 from sqlalchemy import Engine, Select, and_, case, or_, select, update
 
-from stillpath.service.database.engine import reading, writing
 from stillpath.service.database.tables import deliveries, jobs
+from stillpath.service.database.transactions import reading, writing
 from stillpath.service.jobs.state import Job
 
 __all__ = [

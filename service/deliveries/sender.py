@@ -17,7 +17,7 @@ from stillpath.applications.machines.resolve import PinnedMachine
 from stillpath.compensation.defaults import DEFAULT_METHOD
 from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
-from stillpath.service.database.engine import DatabaseAway
+from stillpath.service.database.errors import DatabaseAway
 from stillpath.service.deliveries import rows
 from stillpath.service.deliveries.checking import Checker, PrinterUnknown
 from stillpath.service.deliveries.http_requests import Reply, Unanswered, Unreached

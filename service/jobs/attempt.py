@@ -21,7 +21,7 @@ from typing import Any
 import structlog
 
 from stillpath.pipeline.progress import StopWork
-from stillpath.service.database.engine import DatabaseAway
+from stillpath.service.database.errors import DatabaseAway
 from stillpath.service.jobs.patience import patiently
 from stillpath.service.jobs.problems import (
     input_damaged,

@@ -12,7 +12,7 @@ from typing import Any
 from sqlalchemy import CursorResult, Engine, and_, delete, or_, select, update
 
 from stillpath.service.database import tables
-from stillpath.service.database.engine import insert, reading, writing
+from stillpath.service.database.transactions import insert, reading, writing
 from stillpath.service.jobs.state import JobKind
 from stillpath.service.jobs.stored_rows import OVER
 
@@ -26,7 +26,7 @@ class Expiry:
 
     Notes
     -----
-    Every method raises `service.database.engine.DatabaseAway` if the database does not answer.
+    Every method raises `service.database.errors.DatabaseAway` if the database does not answer.
     """
 
     def __init__(self, engine: Engine) -> None:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import structlog
 
-from stillpath.service.database.engine import DatabaseAway, DatabaseFull
+from stillpath.service.database.errors import DatabaseAway, DatabaseFull
 from stillpath.service.jobs.cluster import Cluster, ClusterAway
 from stillpath.service.jobs.room import RoomForJobs
 from stillpath.service.jobs.state import START_WITHIN_S, Job, JobState, Lost

@@ -31,7 +31,8 @@ from sqlalchemy import (
 )
 
 from stillpath.service.database import tables
-from stillpath.service.database.engine import DatabaseAway, insert, reading, write_together, writing
+from stillpath.service.database.errors import DatabaseAway
+from stillpath.service.database.transactions import insert, reading, write_together, writing
 from stillpath.service.jobs.queue_order import queue_order
 from stillpath.service.jobs.state import (
     WAITING_FOR_ROOM,
@@ -87,7 +88,7 @@ class JobStore:
 
     Notes
     -----
-    Every method raises `service.database.engine.DatabaseAway` if the database does not answer.
+    Every method raises `service.database.errors.DatabaseAway` if the database does not answer.
     """
 
     def __init__(self, engine: Engine) -> None:

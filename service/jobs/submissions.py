@@ -9,7 +9,7 @@ from typing import Any
 from sqlalchemy import Connection, Select, and_, bindparam, case, func, select, text, update
 
 from stillpath.service.database import tables
-from stillpath.service.database.engine import insert
+from stillpath.service.database.transactions import insert
 from stillpath.service.jobs.state import Job
 from stillpath.service.jobs.stored_rows import NOT_OVER, from_row, stored_job, to_row
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import structlog
 
-from stillpath.service.database.engine import DatabaseAway, DatabaseFull
+from stillpath.service.database.errors import DatabaseAway, DatabaseFull
 from stillpath.service.jobs.expiry import Expiry
 from stillpath.service.jobs.state import Job, JobState
 from stillpath.service.jobs.storage_owner import StorageOwner

@@ -17,7 +17,7 @@ import psutil
 import structlog
 
 from stillpath.pipeline.progress import Progress, StopWork
-from stillpath.service.database.engine import DatabaseAway
+from stillpath.service.database.errors import DatabaseAway
 from stillpath.service.jobs.problems import TOO_LONG, TOO_MUCH_MEMORY, problem
 from stillpath.service.jobs.state import Event, Failed, Job, JobKind, Lost, OutOfRoom
 from stillpath.service.jobs.store import JobStore

@@ -17,7 +17,8 @@ from typing import Any
 import structlog
 
 from stillpath.pipeline.progress import Progress, StopWork
-from stillpath.service.database.engine import DatabaseAway, StoreError, open_database
+from stillpath.service.database.engine import open_database
+from stillpath.service.database.errors import DatabaseAway, StoreError
 from stillpath.service.environment import prepare_environment
 from stillpath.service.jobs.attempt import Attempt, WorkerContext
 from stillpath.service.jobs.computations import run_computation

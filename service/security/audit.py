@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any
 import structlog
 from sqlalchemy import Engine, insert, select
 
-from stillpath.service.database.engine import DatabaseAway, reading, writing
+from stillpath.service.database.errors import DatabaseAway
 from stillpath.service.database.tables import audit
+from stillpath.service.database.transactions import reading, writing
 from stillpath.service.security.callers import Caller
 
 if TYPE_CHECKING:

@@ -16,8 +16,8 @@ from pydantic import SecretStr
 from sqlalchemy import Engine, RowMapping, delete, insert, select, update
 from sqlalchemy.exc import IntegrityError
 
-from stillpath.service.database.engine import reading, writing
 from stillpath.service.database.tables import keys
+from stillpath.service.database.transactions import reading, writing
 from stillpath.service.permissions import private_file
 from stillpath.service.security.callers import Caller, Scope
 from stillpath.service.settings import Settings, is_loopback

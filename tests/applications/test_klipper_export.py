@@ -12,6 +12,7 @@ import pytest
 from stillpath.applications.live.export import write_export
 from stillpath.cli.main import run
 from stillpath.compensation.base import DesignError
+from stillpath.compensation.defaults import DT_S
 from stillpath.models.firmware import Marlin
 from stillpath.models.store import load_machine
 from stillpath.pipeline.compensate import compensate_file
@@ -20,7 +21,6 @@ from stillpath.pipeline.files import default_cache_dir
 from stillpath.pipeline.live_design import design_live, live_filter
 from stillpath.pipeline.measuring.reference_shaper import cached_shaper
 from stillpath.pipeline.options import Options
-from stillpath.pipeline.piece_compensator import DT_S
 from stillpath.pipeline.simulate import simulate_motion
 from tests.integrations.interrupted import two_objects
 

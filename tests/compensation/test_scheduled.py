@@ -10,9 +10,9 @@ from stillpath.compensation.base import Compensator, DesignError
 from stillpath.compensation.fbf import LADDER, PreviewFbf
 from stillpath.compensation.ladder import BAND_MARGIN, functions_within
 from stillpath.compensation.registry import compensator
-from stillpath.compensation.scheduled import BLEND_STEP, DESIGN_STEP, ScheduledCompensator
+from stillpath.compensation.scheduled import DESIGN_STEP, ScheduledCompensator
 from stillpath.models.machine import CommandLimits, Machine
-from stillpath.models.operating import OperatingGrid, machine_at
+from stillpath.models.operating import BLEND_STEP, OperatingGrid, machine_at
 from stillpath.models.plants import Mode, ModesSpec, plant_set
 from stillpath.models.ripple import AxisRipple, RippleHarmonic, RippleSource
 from stillpath.models.schedule import (

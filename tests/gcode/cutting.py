@@ -12,8 +12,9 @@ from stillpath.gcode.types import ProgramBlock
 from stillpath.models.firmware.marlin import MarlinPlanner, PerAxis
 from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine
+from stillpath.pipeline.compensated_piece import CompensatedPiece
 from stillpath.pipeline.options import Options
-from stillpath.pipeline.piece_compensator import CompensatedPiece, PieceCompensator
+from stillpath.pipeline.piece_compensator import PieceCompensator
 
 __all__ = ["HEAD", "MARLIN_PLANNER", "blocks_of", "compensated", "cut", "ender3_with", "pieces_of"]
 

@@ -16,9 +16,10 @@ from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.pieces import Piece
 from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine
+from stillpath.pipeline.compensated_piece import CompensatedPiece, deviation
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.pipeline.options import Options
-from stillpath.pipeline.piece_compensator import CompensatedPiece, PieceCompensator, deviation
+from stillpath.pipeline.piece_compensator import PieceCompensator
 from tests.gcode.cutting import HEAD, blocks_of, compensated, pieces_of
 
 BODIES = {

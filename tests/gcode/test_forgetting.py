@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from stillpath.gcode import state
+from stillpath.gcode import tables
 from stillpath.gcode.firmware.planning import join_phases
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.interpreter import Interpreter
@@ -20,7 +20,7 @@ from tests.gcode.cutting import HEAD, cut
 from tests.gcode.prints import made_up_print
 
 ROWS = 10_000
-MOST_ROWS = state._MOST_ROWS
+MOST_ROWS = tables._MOST_ROWS
 
 
 @pytest.fixture(scope="module", params=["klipper", "marlin", "reprapfirmware"])
@@ -67,7 +67,7 @@ def test_pieces_are_the_same(machine: Machine, monkeypatch: pytest.MonkeyPatch, 
     """Also where every block has tables of its own."""
     data = a_print(seed)
     wanted = cut(data, machine, longest_s=20.0)
-    monkeypatch.setattr(state, "_MOST_ROWS", 0)
+    monkeypatch.setattr(tables, "_MOST_ROWS", 0)
     blocks = blocks_of(data, machine, 700)
     assert all(one.limits is not other.limits for one, other in pairwise(blocks))
     found = cut(data, machine, chunk=700, longest_s=20.0)
@@ -87,7 +87,7 @@ def test_plans_are_the_same(machine: Machine, monkeypatch: pytest.MonkeyPatch, s
     data = a_print(seed)
     plans = []
     for most_rows in (MOST_ROWS, 0):
-        monkeypatch.setattr(state, "_MOST_ROWS", most_rows)
+        monkeypatch.setattr(tables, "_MOST_ROWS", most_rows)
         planner = adapter(machine).planner()
         parts = [planner.push(block) for block in blocks_of(data, machine, 700)]
         plans.append(join_phases([*parts, planner.flush()]))

@@ -15,7 +15,7 @@ from stillpath.gcode.plan import plan_moves
 from stillpath.gcode.sampler import sample_phases
 from stillpath.gcode.types import Limits, Moves, rows_of
 from stillpath.models.machine import Machine
-from stillpath.pipeline.piece_compensator import CompensatedPiece
+from stillpath.pipeline.compensated_piece import CompensatedPiece
 from tests.gcode.cutting import HEAD, compensated, ender3_with
 
 BODY = (

@@ -19,7 +19,7 @@ from stillpath.models.firmware import Marlin
 from stillpath.models.firmware.marlin import PerAxis
 from stillpath.models.machine import CommandLimits, Machine
 from stillpath.models.store import load_machine
-from stillpath.pipeline.piece_compensator import Unfit
+from stillpath.pipeline.compensated_piece import Unfit
 from tests.gcode.cutting import HEAD, MARLIN_PLANNER, compensated, pieces_of
 
 K_S = 0.05

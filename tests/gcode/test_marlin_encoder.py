@@ -33,7 +33,7 @@ from stillpath.models.firmware import Marlin
 from stillpath.models.firmware.marlin import MarlinPlanner, MarlinShaper, PerAxis
 from stillpath.models.machine import CommandLimits, Machine
 from stillpath.models.store import load_machine
-from stillpath.pipeline.piece_compensator import deviation
+from stillpath.pipeline.compensated_piece import deviation
 from tests.compensating import compensated
 from tests.gcode.cutting import HEAD, MARLIN_PLANNER
 from tests.gcode.cutting import compensated as compensated_piece

@@ -13,8 +13,8 @@ from stillpath.gcode.types import Phases
 from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
 from stillpath.pipeline.compensate import compensate_file
+from stillpath.pipeline.compensated_piece import CompensatedPiece, deviation
 from stillpath.pipeline.options import Options
-from stillpath.pipeline.piece_compensator import CompensatedPiece, deviation
 from tests.gcode.cutting import HEAD, compensated, ender3_with
 
 SLOPE = 0.005

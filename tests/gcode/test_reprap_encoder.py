@@ -26,13 +26,10 @@ from stillpath.models.firmware import RepRapFirmware
 from stillpath.models.firmware.reprapfirmware import Drive, RepRapExtruder, RepRapShaper
 from stillpath.models.machine import CommandLimits, Machine
 from stillpath.models.store import load_machine
+from stillpath.pipeline.compensated_piece import Unfit, deviation
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.pipeline.options import Options
-from stillpath.pipeline.piece_compensator import (
-    PieceCompensator,
-    Unfit,
-    deviation,
-)
+from stillpath.pipeline.piece_compensator import PieceCompensator
 from tests.gcode.cutting import HEAD, compensated, pieces_of
 from tests.gcode.test_encoder import BODIES
 

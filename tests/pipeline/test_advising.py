@@ -32,7 +32,7 @@ from stillpath.pipeline.advising.trials import Trial
 from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.file_dialect import dialect_for
 from stillpath.pipeline.options import Options
-from stillpath.pipeline.pacing.samples import take_samples
+from stillpath.pipeline.pacing.excerpts import take_excerpts
 from stillpath.pipeline.result import Result
 from stillpath.pipeline.simulate import simulate_file
 from stillpath.simulation.machine_response import MachineStream
@@ -222,8 +222,8 @@ def test_trials_shape_what_the_guides_receive(friction_mm: float | None) -> None
     axes = {a: plants.model_copy(update=update) for a, plants in machine.axes.items()}
     machine = machine.model_copy(update={"axes": axes})
     dialect = dialect_for(machine, None)
-    samples = take_samples(io.BytesIO(printed()), machine, dialect)
-    trial = Trial(samples, {}, machine, adapter(machine).adviser(dialect), 1e-3, [None])
+    excerpts = take_excerpts(io.BytesIO(printed()), machine, dialect)
+    trial = Trial(excerpts, {}, machine, adapter(machine).adviser(dialect), 1e-3, [None])
     shaping = Shaping(AxisShaper("ei", 45.0), AxisShaper("ei", 35.0))
     command = shape_xy(trial._path, 1e-3, (shaping.x.pulses(), shaping.y.pulses()))
     moved = MachineStream(machine, 1e-3).push(command, trial._path)

@@ -12,9 +12,10 @@ from stillpath.models.firmware import RepRapFirmware
 from stillpath.models.firmware.reprapfirmware import Drive
 from stillpath.models.machine import AxisTravel, CommandLimits, Machine
 from stillpath.models.store import load_machine
+from stillpath.pipeline.compensated_piece import deviation
 from stillpath.pipeline.following import strayed
 from stillpath.pipeline.options import Options
-from stillpath.pipeline.piece_compensator import PieceCompensator, deviation
+from stillpath.pipeline.piece_compensator import PieceCompensator
 from tests.compensating import compensated
 from tests.gcode.cutting import HEAD, pieces_of
 

@@ -25,12 +25,13 @@ from stillpath.models.plants import plant_set
 from stillpath.models.reference_motion import reference_motion
 from stillpath.models.store import load_machine
 from stillpath.pipeline.compensate import compensate_file
+from stillpath.pipeline.compensated_piece import Unfit
 from stillpath.pipeline.last_check.errors import LastCheckError
 from stillpath.pipeline.measuring.measure import STRIDE, Measurement
 from stillpath.pipeline.measuring.points import MotionSamples
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.pipeline.options import Options
-from stillpath.pipeline.piece_compensator import PieceCompensator, Unfit
+from stillpath.pipeline.piece_compensator import PieceCompensator
 from stillpath.pipeline.progress import Progress, StopWork
 from stillpath.pipeline.result import ErrorFigures, Result
 from stillpath.pipeline.simulate import plan_file, simulate_file

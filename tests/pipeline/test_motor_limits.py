@@ -10,10 +10,11 @@ import pytest
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from stillpath.compensation.defaults import DT_S
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine
-from stillpath.pipeline.piece_compensator import DT_S, CompensatedPiece, Unfit
+from stillpath.pipeline.compensated_piece import CompensatedPiece, Unfit
 from tests.gcode.cutting import HEAD, compensated, ender3_with
 
 ZIGZAG = "".join(

@@ -11,8 +11,8 @@ from stillpath.gcode.pieces import Piece
 from stillpath.models.machine import Machine
 from stillpath.models.schedule import EMPTY
 from stillpath.models.store import load_machine
+from stillpath.pipeline.compensated_piece import Unfit
 from stillpath.pipeline.measuring.points import MotionSamples
-from stillpath.pipeline.piece_compensator import Unfit
 from stillpath.pipeline.result import Result
 from stillpath.pipeline.simulate import simulate_file
 from stillpath.pipeline.verifying import Verifier

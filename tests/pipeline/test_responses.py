@@ -62,13 +62,13 @@ def test_parts_join_to_the_response_of_the_whole_motion(
         path, executed = walk(seed, 12_000), walk(seed + 10, 12_000)
         found = [part for part in pushed(answers, path, executed) if part is not None]
         assert len(found) > 1
-        answer = np.concatenate([part.answer_mm for part in found], axis=2)
+        response = np.concatenate([part.response_mm for part in found], axis=2)
         np.testing.assert_array_equal(np.concatenate([p.path_mm for p in found], axis=1), path)
         np.testing.assert_array_equal(
             np.concatenate([p.executed_mm for p in found], axis=1), executed
         )
         shaped = np.stack([shape(p, DT_S, q) for p, q in zip(path, pulses, strict=True)])
         commands = {"before": path if compensated else executed, "after": executed}
-        for name, one in zip(names, answer, strict=True):
+        for name, one in zip(names, response, strict=True):
             whole = MachineStream(ender, DT_S).push(commands.get(name, shaped), path)
             np.testing.assert_allclose(one, whole, rtol=0.0, atol=1e-9)

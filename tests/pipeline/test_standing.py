@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from scipy.signal import lsim
 
+from stillpath.compensation.defaults import DT_S
 from stillpath.gcode.timeline import group_rows
 from stillpath.models.arrays import Array
 from stillpath.models.machine import Machine
 from stillpath.models.plant_specs import RelativeModesSpec
 from stillpath.models.plants import PlantSetSpec, plant_set
 from stillpath.pipeline.options import Options
-from stillpath.pipeline.piece_compensator import DT_S, PieceCompensator
+from stillpath.pipeline.piece_compensator import PieceCompensator
 from stillpath.pipeline.standing import Standing, yielding_s2
 from tests.gcode.cutting import HEAD, ender3_with, pieces_of
 

@@ -54,10 +54,10 @@ def pressure_advance(state: MachineState, command: Command) -> int:
             return _flush(state, EventKind.STOP, before_s)
         extruder = int(found[1] or 0)
     smooth_s = _extruder_smooth_s(state, extruder)
-    again = f"ADVANCE {extruder}" in state.factors
+    again = f"ADVANCE {extruder}" in state.settings
     for key in ("ADVANCE", "SMOOTH_TIME"):
         if key in given:
-            state.factors[f"{key} {extruder}"] = _number(given[key])
+            state.settings[f"{key} {extruder}"] = _number(given[key])
     if _extruder_smooth_s(state, extruder) == smooth_s and not _always_stops(state, command):
         if again and state.i[at.I_KNOWN] & 3 == 3:
             state.warn(_MAY_STOP)
@@ -76,15 +76,15 @@ def shaper(state: MachineState, command: Command) -> int:
             f_hz = _number(given[f"SHAPER_FREQ_{axis}"])
         if f"DAMPING_RATIO_{axis}" in given:
             damping = _number(given[f"DAMPING_RATIO_{axis}"])
-        state.factors[f"shaper {axis}"] = float(_KINDS.index(_modelled(kind)))
-        state.factors[f"f_hz {axis}"] = f_hz
-        state.factors[f"damping {axis}"] = damping
+        state.settings[f"shaper {axis}"] = float(_KINDS.index(_modelled(kind)))
+        state.settings[f"f_hz {axis}"] = f_hz
+        state.settings[f"damping {axis}"] = damping
     return _flush(state, EventKind.SHAPER, before_s)
 
 
 def _flush(state: MachineState, kind: EventKind, before_s: float) -> int:
     """Write an event that stands for the look-ahead, less what was counted at this rest."""
-    known = state.factors
+    known = state.settings
     # A macro may have moved.
     place, counted_s = state.moves + int(state.i[at.I_MACROS]), 0.0
     if known.get("flushed at") == place:
@@ -110,23 +110,23 @@ def _ahead_s(state: MachineState) -> float:
     """Return how far ahead of the motion steps are made."""
     # Those without a line of their own are as in printer.cfg, like the one in use.
     extruders = {int(state.i[at.I_TOOL])}
-    extruders |= {int(key.split()[1]) for key in state.factors if key.startswith(_SET)}
+    extruders |= {int(key.split()[1]) for key in state.settings if key.startswith(_SET)}
     smooth_s = max(_extruder_smooth_s(state, extruder) for extruder in extruders)
     return max(_LEAST_S, 0.5 * smooth_s, *(_reach_s(*_shaper(state, axis)) for axis in "XY"))
 
 
 def _extruder_smooth_s(state: MachineState, extruder: int) -> float:
     """Return the time over which an extruder's speed is averaged; 0: it is not."""
-    advance_s = state.factors.get(f"ADVANCE {extruder}", state.machine.pressure_advance_s)
+    advance_s = state.settings.get(f"ADVANCE {extruder}", state.machine.pressure_advance_s)
     if not (advance_s > 0.0 and isinstance(state.firmware, Klipper)):
         return 0.0
     stated_s = state.firmware.extruder.pressure_advance_smooth_time_s
-    return min(state.factors.get(f"SMOOTH_TIME {extruder}", stated_s), _MOST_SMOOTH_S)
+    return min(state.settings.get(f"SMOOTH_TIME {extruder}", stated_s), _MOST_SMOOTH_S)
 
 
 def _shaper(state: MachineState, axis: str) -> tuple[str, float, float]:
     """Return an axis' shaper: type, frequency, damping; before the first line printer.cfg's."""
-    known = state.factors
+    known = state.settings
     if f"shaper {axis}" in known:
         kind = int(known[f"shaper {axis}"])
         return _KINDS[kind], known[f"f_hz {axis}"], known[f"damping {axis}"]

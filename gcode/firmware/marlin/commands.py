@@ -125,12 +125,12 @@ def linear_advance(state: MachineState, command: Command) -> int:
     used = int(state.i[at.I_TOOL])
     named = int(given.get("T", used))
     known = _advance_k_s(state, named)
-    state.factors[f"advance {named}"] = k
+    state.settings[f"advance {named}"] = k
     if named == used:
-        state.factors["advance"] = k
+        state.settings["advance"] = k
         state.hold("linear advance", False)
     else:
-        state.factors["advance by tool"] = 1.0
+        state.settings["advance by tool"] = 1.0
     if k == known:
         # No stop; but a stream has K off, and there the line would switch it on.
         return state.event(EventKind.LIMITS)
@@ -141,13 +141,13 @@ def linear_advance(state: MachineState, command: Command) -> int:
 def tool(state: MachineState, command: Command) -> int:
     """T: another tool, which may have a K of its own; moves wait for M900 where it may or not."""
     found = other_tool(state, command)
-    k, last = _advance_k_s(state, int(state.i[at.I_TOOL])), state.factors.get("advance")
+    k, last = _advance_k_s(state, int(state.i[at.I_TOOL])), state.settings.get("advance")
     firmware = state.machine.firmware
     shared = (
         isinstance(firmware, Marlin)
         and firmware.variant == "2.1"
         and firmware.linear_advance is not False
-        and "advance by tool" not in state.factors
+        and "advance by tool" not in state.settings
     )
     # A stream that switches advance off and on again would set a wrong K for good.
     state.hold("linear advance", shared and last is not None and last != k)
@@ -161,9 +161,9 @@ def speed_factor(state: MachineState, command: Command) -> int:
     f = state.f
     percent = f[at.F_SPEED_FACTOR] * 6000.0
     if "B" in command.words:
-        state.factors["M220"] = percent
+        state.settings["M220"] = percent
     if "R" in command.words:
-        percent = state.factors.get("M220", 100.0)
+        percent = state.settings.get("M220", 100.0)
     percent = _whole(state, command).get("S", percent)
     if percent <= 0.0:
         raise state.problem("a speed of 0 % stops the print for good; leave M220 S0 out", command)
@@ -263,7 +263,7 @@ def reset_limits(state: MachineState, command: Command) -> int:
     state.settle()
     state.f[at.F_LIMITS : at.F_LIMITS + len(row)] = row
     state.note_limits()
-    state.factors = {k: v for k, v in state.factors.items() if not k.startswith("advance")}
+    state.settings = {k: v for k, v in state.settings.items() if not k.startswith("advance")}
     state.hold("linear advance", False)
     state.warn(f"{command.name}: from here on the position is not known until the printer homes")
     state.forget(origin=True)
@@ -330,7 +330,7 @@ def not_modelled(kind: EventKind, why: str, *, origin: bool = True) -> Handler:
 def _advance_k_s(state: MachineState, tool: int) -> float:
     """Return a tool's K of linear advance; before M900 the machine's [s]."""
     column = state.limits_names.index("linear_advance_k_s")
-    return state.factors.get(f"advance {tool}", float(state.initial_limits[column]))
+    return state.settings.get(f"advance {tool}", float(state.initial_limits[column]))
 
 
 def _other_tool(state: MachineState, given: Mapping[str, float]) -> bool:

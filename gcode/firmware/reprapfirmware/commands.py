@@ -116,7 +116,7 @@ def pressure_advance(state: MachineState, command: Command) -> int:
         return state.event(EventKind.HARMLESS)
     used = str(state.i[at.I_TOOL])
     extruders = command.words.get("D", used).strip("{}").split(":")
-    state.factors.update((f"advance {extruder}", given["S"]) for extruder in extruders)
+    state.settings.update((f"advance {extruder}", given["S"]) for extruder in extruders)
     values = {}
     if used in extruders:
         values = {"pressure_advance_s": given["S"]}
@@ -129,7 +129,7 @@ def tool(state: MachineState, command: Command) -> int:
     found = other_tool(state, command)
     row, column = state.initial_limits, state.limits_names.index("pressure_advance_s")
     key = f"advance {state.i[at.I_TOOL]}"
-    state.f[at.F_LIMITS + column] = state.factors.get(key, row[column])
+    state.f[at.F_LIMITS + column] = state.settings.get(key, row[column])
     state.note_limits()
     return found
 
@@ -273,22 +273,22 @@ def machine_mode(state: MachineState, command: Command) -> int:
 
 def push_state(state: MachineState, command: Command) -> int:
     """M120."""
-    depth = int(state.factors.get("pushed", 0.0))
+    depth = int(state.settings.get("pushed", 0.0))
     if depth >= _MOST_PUSHED:
         raise state.problem("M120 without M121; the firmware's stack overflows", command)
     state.saved[f"M120 {depth}"] = Saved(state.f.copy(), state.i.copy())
-    state.factors["pushed"] = depth + 1.0
+    state.settings["pushed"] = depth + 1.0
     return state.event(EventKind.STATE)
 
 
 def pop_state(state: MachineState, _command: Command) -> int:
     """M121: the modes, the plane, the units and F of the matching M120."""
-    depth = int(state.factors.get("pushed", 0.0)) - 1
+    depth = int(state.settings.get("pushed", 0.0)) - 1
     if depth < 0:
         state.warn("M121 without M120 is ignored")
         return state.event(EventKind.HARMLESS)
     saved = state.saved[f"M120 {depth}"]
-    state.factors["pushed"] = float(depth)
+    state.settings["pushed"] = float(depth)
     state.settle()
     for slot in _MODES:
         state.i[slot] = saved.i[slot]

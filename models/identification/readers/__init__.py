@@ -5,7 +5,11 @@ from stillpath.models.identification.readers.assumed_test import (
     assumed_test,
     date_in_name,
 )
-from stillpath.models.identification.readers.reading import read_content, read_measurements
+from stillpath.models.identification.readers.reading import (
+    LARGEST_BYTES,
+    read_content,
+    read_measurements,
+)
 from stillpath.models.identification.readers.settings import (
     ReadSettings,
     direction_of,
@@ -13,6 +17,7 @@ from stillpath.models.identification.readers.settings import (
 )
 
 __all__ = [
+    "LARGEST_BYTES",
     "AssumedTest",
     "ReadSettings",
     "assumed_test",

@@ -37,6 +37,7 @@ from stillpath.models.user_files import as_utf8
 __all__ = ["LARGEST_BYTES", "read_content", "read_measurements"]
 
 LARGEST_BYTES = 200_000_000
+"""Of a measurement, as a file, as an upload, and unpacked."""
 _LARGEST_MODEL_BYTES = 16_000_000
 _HEAD_BYTES = 16_384
 
@@ -93,7 +94,12 @@ def read_measurements(
 def read_content(
     content: bytes, name: str, *, settings: ReadSettings | None = None
 ) -> tuple[Measurement, ...]:
-    """Read the content of a file called `name`; see `read_measurements`."""
+    """Read the content of a file called `name`; see `read_measurements`.
+
+    Raises
+    ------
+    ModelError
+    """
     settings = settings or ReadSettings()
     content = unpacked(content, name, LARGEST_BYTES)
     content = as_utf8(content)

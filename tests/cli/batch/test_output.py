@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from stillpath.cli.batch.output import Figures, Outcome, OutputFolder, sha256_of
+from stillpath.cli.batch.output import Figures, Outcome, OutputFolder
+from stillpath.service.storage.base import sha256_of
 from stillpath.service.storage.local import LocalStorage
 
 TEXT = "; compensated\nG28\n"
@@ -71,7 +72,8 @@ def test_what_file_managers_leave_is_no_obstacle(tmp_path):
         done(output)
     (tmp_path / ".stillpath" / "work" / ".DS_Store").write_bytes(b"x")
     with OutputFolder.opened(tmp_path) as output:
-        done(output, "; the next one\n")
+        outcome = done(output, "; the next one\n")
+    assert (tmp_path / outcome.output).read_text() == "; the next one\n"
 
 
 def test_a_file_system_that_syncs_no_folders(tmp_path, monkeypatch):

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from scipy.signal import butter, correlate, sosfiltfilt
 
 from stillpath.models.errors import ModelError
-from stillpath.models.identification.alignment import align, check_pair, resample
+from stillpath.models.identification.alignment import align, check_pair
+from stillpath.models.identification.chirp_search import resample
 from stillpath.models.identification.excitation import regenerate
 from stillpath.models.identification.synthetic import ADXL345, LIS2DW, Sensor, simulate_log
 from stillpath.models.identification.types import AccelerationLog, Excitation

@@ -17,7 +17,9 @@ import httpx2
 import pytest
 from sqlalchemy.exc import OperationalError
 
-from stillpath.service.database.engine import DatabaseFull, open_database, writing
+from stillpath.service.database.engine import open_database
+from stillpath.service.database.errors import DatabaseFull
+from stillpath.service.database.transactions import writing
 from stillpath.service.settings import Settings
 from stillpath.service.storage.disk import Disk, NoRoom
 from tests.service.small_disk import small_disk

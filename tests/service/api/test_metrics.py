@@ -13,7 +13,8 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from stillpath.service.api.metrics import Metrics
-from stillpath.service.database.engine import DatabaseAway, open_database
+from stillpath.service.database.engine import open_database
+from stillpath.service.database.errors import DatabaseAway
 from stillpath.service.jobs.store import JobStore
 from stillpath.service.settings import Settings
 from stillpath.service.storage.base import StorageError

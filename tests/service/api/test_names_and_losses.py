@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
-from stillpath.service.database.engine import DatabaseAway
+from stillpath.service.database.errors import DatabaseAway
 from tests.service.api.serving import post
 from tests.service.api.test_submitting import folders
 from tests.service.test_api import assert_problem, over, until

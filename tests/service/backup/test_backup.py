@@ -18,7 +18,8 @@ from sqlalchemy import Engine
 from stillpath.cli.main import run
 from stillpath.service.backup import archive
 from stillpath.service.backup.archive import BackupError, back_up, restore
-from stillpath.service.database.engine import StoreError, open_database
+from stillpath.service.database.engine import open_database
+from stillpath.service.database.errors import StoreError
 from stillpath.service.deliveries.rows import deliveries_of
 from stillpath.service.instance_lock import exclusive
 from stillpath.service.jobs.state import JobKind, JobState

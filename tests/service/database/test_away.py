@@ -12,8 +12,9 @@ from pathlib import Path
 import pytest
 from sqlalchemy import text
 
-from stillpath.service.database import engine as database
-from stillpath.service.database.engine import DatabaseAway, open_database
+from stillpath.service.database.engine import open_database
+from stillpath.service.database.errors import DatabaseAway
+from stillpath.service.database.transactions import reading
 from stillpath.service.jobs.state import JobState
 from stillpath.service.jobs.store import JobStore
 from stillpath.service.settings import Settings
@@ -71,7 +72,7 @@ def test_postgresql_behind_a_pooler(postgres_url: str, tmp_path: Path):
     for _ in range(20):
         store.counts()
         store.check()
-    with database.reading(engine) as connection:
+    with reading(engine) as connection:
         for kept in ("pg_prepared_statements", "pg_cursors", "pg_listening_channels()"):
             assert connection.scalar(text(f"SELECT count(*) FROM {kept}")) == 0
     engine.dispose()
@@ -109,7 +110,7 @@ def test_sqlite_that_is_deleted_while_it_is_open_accepts_nothing(tmp_path: Path,
 
 
 def test_sqlite_kept_by_somebody_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(database, "_BUSY_TIMEOUT_MS", 50)
+    monkeypatch.setattr("stillpath.service.database.engine.BUSY_TIMEOUT_MS", 50)
     engine = open_database(Settings(data_dir=tmp_path))
     store = JobStore(engine)
     job = store.add(make_job())

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from stillpath.cli.main import run
-from stillpath.service.database.engine import StoreError, open_database
+from stillpath.service.database.engine import open_database
+from stillpath.service.database.errors import StoreError
 from stillpath.service.settings import Settings
 from tests.service.machines import make_machine
 

@@ -17,14 +17,9 @@ import pytest
 from sqlalchemy import URL, Connection, Engine, select
 
 from stillpath.service.database import tables
-from stillpath.service.database.engine import (
-    DatabaseAway,
-    make_engine,
-    open_database,
-    reading,
-    write_together,
-    writing,
-)
+from stillpath.service.database.engine import make_engine, open_database
+from stillpath.service.database.errors import DatabaseAway
+from stillpath.service.database.transactions import reading, write_together, writing
 from stillpath.service.jobs.state import Cancelled, Event, Failed, JobState, Lost
 from stillpath.service.jobs.store import JobStore
 from stillpath.service.jobs.submissions import Quota, QuotaExceeded
@@ -267,7 +262,7 @@ def test_who_loses_patience_hears_the_truth(tmp_path: Path, monkeypatch: pytest.
     engine = make_engine(URL.create("sqlite", database=str(tmp_path / "x.sqlite3")))
     with writing(engine) as connection:
         connection.exec_driver_sql("CREATE TABLE t (n INTEGER)")
-    monkeypatch.setattr("stillpath.service.database.engine._BUSY_TIMEOUT_MS", 60)
+    monkeypatch.setattr("stillpath.service.database.transactions.BUSY_TIMEOUT_MS", 60)
 
     def wish(n: int) -> object:
         def work(connection: Connection) -> int:

@@ -11,8 +11,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from sqlalchemy import Engine, select, text
 
-from stillpath.service.database.engine import reading, writing
 from stillpath.service.database.tables import deliveries
+from stillpath.service.database.transactions import reading, writing
 from stillpath.service.jobs.expiry import Expiry
 from stillpath.service.jobs.state import (
     Cancelled,

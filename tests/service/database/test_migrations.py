@@ -11,16 +11,11 @@ from alembic.script import ScriptDirectory
 from sqlalchemy import Engine, inspect, text
 
 from stillpath.service.database import migrations
-from stillpath.service.database.engine import (
-    StoreError,
-    database_url,
-    migrate,
-    open_database,
-    reading,
-    writing,
-)
+from stillpath.service.database.engine import database_url, migrate, open_database
+from stillpath.service.database.errors import StoreError
 from stillpath.service.database.migrations import LATEST
 from stillpath.service.database.tables import metadata
+from stillpath.service.database.transactions import reading, writing
 from stillpath.service.jobs.store import JobStore
 from stillpath.service.settings import Settings
 from tests.service.database.examples import make_job

@@ -16,7 +16,8 @@ from typing import Any
 import psutil
 
 from stillpath.applications.machines.resolve import PinnedMachine
-from stillpath.service.database.engine import DatabaseAway, open_database
+from stillpath.service.database.engine import open_database
+from stillpath.service.database.errors import DatabaseAway
 from stillpath.service.jobs.state import Cancelled, Job, JobState
 from stillpath.service.jobs.store import JobStore
 from stillpath.service.jobs.sweep import sweep_files

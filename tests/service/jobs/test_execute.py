@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from stillpath.pipeline.progress import Progress
-from stillpath.service.database.engine import DatabaseAway
+from stillpath.service.database.errors import DatabaseAway
 from stillpath.service.jobs import attempt, patience
 from stillpath.service.jobs.attempt import WorkerContext
 from stillpath.service.jobs.room import RoomForJobs

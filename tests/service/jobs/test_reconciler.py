@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from stillpath.service.database.engine import DatabaseAway
+from stillpath.service.database.errors import DatabaseAway
 from stillpath.service.jobs import reconciler, room
 from stillpath.service.jobs.attempt import WorkerContext
 from stillpath.service.jobs.reconciler import Reconciler

@@ -142,6 +142,7 @@ def test_a_reader_sees_the_old_file_or_the_new_one(storage: Storage, tmp_path: P
         put(storage, "jobs/a/file", bytes([n]) * size, tmp_path)
     done.set()
     reader.join()
+    assert seen
     assert all(len(found) == size and len(set(found)) == 1 for found in seen)
 
 

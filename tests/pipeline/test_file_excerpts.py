@@ -10,7 +10,7 @@ import pytest
 from stillpath.gcode.pacing import AS_SLICED, FirstLayer
 from stillpath.models.store import load_machine
 from stillpath.pipeline.file_dialect import dialect_for
-from stillpath.pipeline.pacing.samples import FileSamples, take_samples
+from stillpath.pipeline.pacing.excerpts import FileExcerpts, take_excerpts
 
 MACHINE = load_machine("ender3")
 PURGE = "G28\nM83\nG1 Z.3 F600\nG1 X5 Y5 F6000\nG1 Y80 E8 F1500\n"
@@ -21,16 +21,16 @@ def layer(z_mm: float, mark: str = ";LAYER_CHANGE\n") -> str:
     return f"{mark}G1 Z{z_mm} F600\nG1 X40 Y40 F9000\n;TYPE:Perimeter\n{4 * ring}"
 
 
-def taken(text: str) -> FileSamples:
-    return take_samples(io.BytesIO(text.encode()), MACHINE, dialect_for(MACHINE))
+def taken(text: str) -> FileExcerpts:
+    return take_excerpts(io.BytesIO(text.encode()), MACHINE, dialect_for(MACHINE))
 
 
-def heights(samples: FileSamples) -> set[float]:
+def heights(excerpts: FileExcerpts) -> set[float]:
     """Heights of all moves whose pace may change."""
     found: set[float] = set()
-    for sample in samples.samples:
-        free = sample.classes != AS_SLICED
-        found |= set(np.round(sample.piece.moves.end_mm[free, 2], 3).tolist())
+    for one in excerpts.excerpts:
+        free = one.classes != AS_SLICED
+        found |= set(np.round(one.piece.moves.end_mm[free, 2], 3).tolist())
     return found
 
 

@@ -1,8 +1,8 @@
-"""Take samples of some seconds of every class of moves from all over a file.
+"""Take excerpts of some seconds of every class of moves from all over a file.
 
-Memory is bounded: each class keeps a limited number of samples. When there are more, every second
+Memory is bounded: each class keeps a limited number of excerpts. When there are more, every second
 one is dropped, and from then on only every second one is taken. The same file gives the same
-samples.
+excerpts.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from stillpath.models.machine import Machine
 from stillpath.models.schedule import OperatingPoint
 from stillpath.pipeline.operating_point import Operation
 
-__all__ = ["FileSamples", "Sample", "take_samples"]
+__all__ = ["Excerpt", "FileExcerpts", "take_excerpts"]
 
 _LASTS_S = 4.0
 _TOTAL_S = 120.0
 _FEWEST, _MOST = 3, 12
 _SPREAD = 0.6180339887498949
-"""Golden ratio: spreads samples within pieces without aliasing with the file."""
+"""Golden ratio: spreads excerpts within pieces without aliasing with the file."""
 
 
 @dataclass(frozen=True, slots=True)
-class Sample:
+class Excerpt:
     """Some moves of a file and their operating point."""
 
     piece: Piece
@@ -43,44 +43,44 @@ class Sample:
 
 
 @dataclass(frozen=True, slots=True)
-class FileSamples:
-    """Samples of a file."""
+class FileExcerpts:
+    """Excerpts of a file."""
 
-    samples: list[Sample]
+    excerpts: list[Excerpt]
     first_layer: FirstLayer
 
 
 @dataclass(slots=True)
 class _Places:
-    """Samples of one class."""
+    """Excerpts of one class."""
 
     stride: int = 1
     seen: int = 0
-    kept: list[tuple[int, int, int, Sample]] = field(default_factory=list)
+    kept: list[tuple[int, int, int, Excerpt]] = field(default_factory=list)
 
     @property
     def due(self) -> bool:
         return self.seen % self.stride == 0
 
-    def add(self, where: tuple[int, int, int], sample: Sample) -> None:
-        self.kept.append((*where, sample))
+    def add(self, where: tuple[int, int, int], taken: Excerpt) -> None:
+        self.kept.append((*where, taken))
         if len(self.kept) > 2 * _MOST:
             self.kept = self.kept[::2]
             self.stride *= 2
 
-    def some(self, count: int) -> list[tuple[int, int, int, Sample]]:
+    def some(self, count: int) -> list[tuple[int, int, int, Excerpt]]:
         if len(self.kept) <= count:
             return self.kept
         return [self.kept[i] for i in np.linspace(0, len(self.kept) - 1, count).round().astype(int)]
 
 
-def take_samples(
+def take_excerpts(
     source: BinaryIO,
     machine: Machine,
     dialect: Dialect,
     progress: Callable[[float], None] | None = None,
-) -> FileSamples:
-    """Read a file to its end and take samples of all moves whose pace may change.
+) -> FileExcerpts:
+    """Read a file to its end and take excerpts of all moves whose pace may change.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ def take_samples(
     wanted = [one for (below, _), one in sorted(places.items()) if below == first_layer.below]
     each = int(np.clip(_TOTAL_S / _LASTS_S / max(len(wanted), 1), _FEWEST, _MOST))
     chosen = {entry[:3]: entry[3] for one in wanted for entry in one.some(each)}
-    return FileSamples([_above(chosen[key], first_layer) for key in sorted(chosen)], first_layer)
+    return FileExcerpts([_above(chosen[key], first_layer) for key in sorted(chosen)], first_layer)
 
 
 def _items(
@@ -135,7 +135,7 @@ def _take(
     machine: Machine,
     first_layer: FirstLayer,
 ) -> None:
-    """Take the samples of a piece that are due."""
+    """Take the excerpts of a piece that are due."""
     classes = move_classes(piece.moves, first_layer)
     for one in np.unique(classes[classes != AS_SLICED]).tolist():
         place = places.setdefault((first_layer.below, one), _Places())
@@ -145,7 +145,7 @@ def _take(
             first, last = _around(piece.phases, row)
             part = excerpt(piece, first, last, machine)
             if len(part.phases) == len(part.moves):
-                place.add((number, first, last), Sample(part, classes[first:last], point))
+                place.add((number, first, last), Excerpt(part, classes[first:last], point))
         place.seen += 1
 
 
@@ -167,6 +167,6 @@ def _around(phases: Phases, row: int) -> tuple[int, int]:
     return first, last + 1
 
 
-def _above(sample: Sample, first_layer: FirstLayer) -> Sample:
-    classes = move_classes(sample.piece.moves, first_layer)
-    return Sample(sample.piece, classes, sample.point)
+def _above(taken: Excerpt, first_layer: FirstLayer) -> Excerpt:
+    classes = move_classes(taken.piece.moves, first_layer)
+    return Excerpt(taken.piece, classes, taken.point)

@@ -1,4 +1,4 @@
-"""Errors of everything that explains a measurement, on a sample of the print itself."""
+"""Errors of everything that explains a measurement, on excerpts of the print itself."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.pipeline.result import Channel
 from stillpath.simulation.measures import PathDistances
 
-__all__ = ["MotionSample"]
+__all__ = ["MotionExcerpts"]
 
 _STRETCH_S, _MOST = 3.0, 40
 """Length of a stretch, and the most that are kept: every second one is dropped when there are more,
@@ -35,7 +35,7 @@ _STRIDE = 5
 """Contour errors are measured at every fifth sample."""
 
 
-class MotionSample:
+class MotionExcerpts:
     """Keep some stretches of a print's motion, and find the range of its errors on them.
 
     Parameters

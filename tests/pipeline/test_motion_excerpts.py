@@ -1,4 +1,4 @@
-"""The range of a print's errors, from a sample of its motion."""
+"""The range of a print's errors, from excerpts of its motion."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from stillpath.models.machine import Machine
 from stillpath.models.plants import PlantSetSpec, RelativeMode, RelativeModesSpec, WeightedMember
 from stillpath.models.reference_motion import reference_motion
 from stillpath.models.store import load_machine
-from stillpath.pipeline.measuring import sample
+from stillpath.pipeline.measuring import excerpts
+from stillpath.pipeline.measuring.excerpts import MotionExcerpts
 from stillpath.pipeline.measuring.points import MotionSamples
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
-from stillpath.pipeline.measuring.sample import MotionSample
 
 DT_S = 1e-3
 ZETA, WINDOW = 0.06, 80
@@ -68,7 +68,7 @@ def contour_um(path: np.ndarray, moved: np.ndarray, extruding: np.ndarray) -> fl
 def test_the_range_is_that_of_the_plants_on_the_print_itself() -> None:
     """As all members follow the whole print from its start."""
     path, extruding = reference_motion(DT_S)
-    shown = MotionSample(DT_S)
+    shown = MotionExcerpts(DT_S)
     command = path + 0.02 * np.sin(2 * np.pi * 7.0 * DT_S * np.arange(path.shape[1]))
     shown.add(motion(path, command, extruding))
     ranges = shown.ranges(machine(), SHAPER)
@@ -93,24 +93,24 @@ def test_a_stretch_in_the_middle_of_a_line_shakes_nothing(monkeypatch: pytest.Mo
     path = np.stack([0.1 * np.arange(n), 0.1 * np.arange(n)])
 
     def error_um() -> float:
-        shown = MotionSample(DT_S)
+        shown = MotionExcerpts(DT_S)
         shown.add(motion(path, path, np.ones(n, bool)))
         return shown.ranges(unlike, SHAPER)["before"].reference_um
 
     assert error_um() < 0.01
-    monkeypatch.setattr(sample, "_LEAD_S", 0.0)
-    monkeypatch.setattr(sample, "_from_a_standstill", lambda motion_mm, dt_s: motion_mm.copy())
+    monkeypatch.setattr(excerpts, "_LEAD_S", 0.0)
+    monkeypatch.setattr(excerpts, "_from_a_standstill", lambda motion_mm, dt_s: motion_mm.copy())
     assert error_um() > 1.0
 
 
 def test_a_long_print_is_sampled_along_its_whole_length() -> None:
-    shown = MotionSample(DT_S)
+    shown = MotionExcerpts(DT_S)
     n = 1500
     for k in range(1000):
         path = np.stack([k + 1e-3 * np.arange(n), np.zeros(n)])
         shown.add(motion(path, path, np.ones(n, bool)))
     places = [float(one.path_mm[0, -1]) for one in shown._kept]
-    assert len(places) <= sample._MOST
+    assert len(places) <= excerpts._MOST
     assert places[0] < 50.0
     assert places[-1] > 950.0
     assert np.ptp(np.diff(places)) < 1e-6
@@ -119,7 +119,7 @@ def test_a_long_print_is_sampled_along_its_whole_length() -> None:
 def test_pieces_of_half_a_second_count_from_their_standstill() -> None:
     path, extruding = reference_motion(DT_S)
     first = int(np.flatnonzero(extruding)[0])
-    shown = MotionSample(DT_S)
+    shown = MotionExcerpts(DT_S)
     for _ in range(5):
         part = slice(first, first + 500)
         shown.add(motion(path[:, part], path[:, part], extruding[part]))
@@ -129,7 +129,7 @@ def test_pieces_of_half_a_second_count_from_their_standstill() -> None:
 
 def test_travels_alone_say_nothing() -> None:
     path = np.stack([0.1 * np.arange(20_000), np.zeros(20_000)])
-    shown = MotionSample(DT_S)
+    shown = MotionExcerpts(DT_S)
     shown.add(motion(path, path, np.zeros(20_000, bool)))
     shown.add(motion(path[:, :300], path[:, :300], np.ones(300, bool)))
     assert shown.ranges(machine(), SHAPER) == {}
