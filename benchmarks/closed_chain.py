@@ -142,29 +142,7 @@ class Errors:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("files", nargs="*", default=list(FILES), help="paths, or corpus names")
-    parser.add_argument("--printers", type=int, default=30, help="of each kind")
-    parser.add_argument("--first", type=int, default=0, help="seed of the first one")
-    parser.add_argument("--from", dest="source", choices=list(_GOALS), default="spectra")
-    parser.add_argument("--seconds", type=float, default=90.0, help="of each print to judge")
-    parser.add_argument(
-        "--max-accel-mm-s2",
-        type=float,
-        help="of the configuration, from which motors' limits follow (default: the built-in ones)",
-    )
-    parser.add_argument(
-        "--ring-accel-mm-s2", type=float, help="of ring tests (default: the configuration's)"
-    )
-    parser.add_argument("--firmware", choices=("klipper", *OTHERS), default="klipper")
-    parser.add_argument("--load-kg", type=float, default=0.0, help="on the bed, after measuring")
-    parser.add_argument("--belts", type=float, default=1.0, help="stiffness after, over before")
-    parser.add_argument("--friction", type=float, default=1.0, help="of all guides, times as drawn")
-    parser.add_argument("--tolerance-um", type=float, default=Options().tolerance_um)
-    parser.add_argument("--oracle", action="store_true", help="tune shapers on the truth as well")
-    parser.add_argument("--shared", type=Path, help="default: $STILLPATH_SHARED or ../shared")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
-    given = parser.parse_args()
+    given = parsed()
     shared = shared_folder(given.shared)
     one_thread_each()
     rows: list[Row] = []
@@ -202,6 +180,33 @@ def main() -> int:
                 for row in found:
                     print_row(row)
     return summary(rows, given.source)
+
+
+def parsed() -> argparse.Namespace:
+    """Return the options of the command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("files", nargs="*", default=list(FILES), help="paths, or corpus names")
+    parser.add_argument("--printers", type=int, default=30, help="of each kind")
+    parser.add_argument("--first", type=int, default=0, help="seed of the first one")
+    parser.add_argument("--from", dest="source", choices=list(_GOALS), default="spectra")
+    parser.add_argument("--seconds", type=float, default=90.0, help="of each print to judge")
+    parser.add_argument(
+        "--max-accel-mm-s2",
+        type=float,
+        help="of the configuration, from which motors' limits follow (default: the built-in ones)",
+    )
+    parser.add_argument(
+        "--ring-accel-mm-s2", type=float, help="of ring tests (default: the configuration's)"
+    )
+    parser.add_argument("--firmware", choices=("klipper", *OTHERS), default="klipper")
+    parser.add_argument("--load-kg", type=float, default=0.0, help="on the bed, after measuring")
+    parser.add_argument("--belts", type=float, default=1.0, help="stiffness after, over before")
+    parser.add_argument("--friction", type=float, default=1.0, help="of all guides, times as drawn")
+    parser.add_argument("--tolerance-um", type=float, default=Options().tolerance_um)
+    parser.add_argument("--oracle", action="store_true", help="tune shapers on the truth as well")
+    parser.add_argument("--shared", type=Path, help="default: $STILLPATH_SHARED or ../shared")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    return parser.parse_args()
 
 
 def print_row(r: Row) -> None:

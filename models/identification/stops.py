@@ -103,8 +103,7 @@ def responses_of_stops(
     for _ in range(_ROUNDS):
         felt = [_response(*row) for row in zip(logs, received, labels, strict=True)]
         frame = None if frame_firm else _frame_of(felt, frame)
-        bends = [_bend(log, one, frame) for log, one in zip(logs, felt, strict=True)]
-        held_mm = _held_mm(logs, bends)
+        held_mm, bends = _held_mm(logs, felt, frame)
         received = [log.command_mm - held_mm * b for log, b in zip(logs, bends, strict=True)]
     felt = [_response(*row) for row in zip(logs, received, labels, strict=True)]
     frame = None if frame_firm else _frame_of(felt, frame)
@@ -186,53 +185,73 @@ def _transformed(command: Array, measured: Array, rate_hz: float) -> Transformed
     return Transformed(rate_hz / size, u, y)
 
 
-def _bend(log: StopsLog, felt: FrequencyResponse, frame: Frame | None) -> Array:
-    """Return the bend of the guides along the motion as it was, shape (n,), -1 to 1.
+def _bend(log: StopsLog, felt: FrequencyResponse, frame: Frame | None, *, as_felt: bool) -> Array:
+    """Return the bend of the guides along the axis's motion over the frame, shape (n,), -1 to 1.
 
-    What rings is as it was felt, because friction bends it; below `_RINGS_HZ` a sensor's noise,
-    integrated twice, is micrometres, and the axis is where the response says.
+    The motion is the response's to the command, or from `_RINGS_HZ` on as it was felt, because
+    friction bends what rings. Below that a sensor's noise, integrated twice, is micrometres.
     """
     n = len(log.command_mm)
     size = next_fast_len(2 * n, real=True)
     f_hz = rfftfreq(size, 1.0 / log.rate_hz)
+    w = 2.0 * np.pi * np.maximum(f_hz, f_hz[1]) / log.rate_hz
     over_bed = felt if frame is None else frame.over_bed(felt)
-    known = felt.coherence >= LEAST_COHERENCE
-    delay_s = low_frequency_delay(felt.f_hz[known], felt.response[known]) if known.any() else 0.0
-    level = float(np.median(np.abs(over_bed.response[felt.f_hz <= _SLOW_HZ])))
-    w_s = 2.0 * np.pi * np.maximum(f_hz, f_hz[1]) / log.rate_hz
     accel = rfft(np.pad(np.diff(log.command_mm, 2), 1), size)
-    by_response = beyond_slow(_from_start(over_bed), f_hz) * accel
-    measured = rfft(log.measured_mm_s2 / log.rate_hz**2, size) * np.exp(2j * np.pi * f_hz * delay_s)
-    if frame is not None:
-        measured = measured * (1 + frame.reaction(f_hz))
-    as_felt = measured * np.sinc(f_hz / log.rate_hz) ** 2 / level - accel
-    rings = 1.0 / (1.0 + (_RINGS_HZ / np.maximum(f_hz, f_hz[1])) ** _STEEPNESS)
-    more = -(rings * as_felt + (1.0 - rings) * by_response) / w_s**2
-    return bend_of(log.command_mm + irfft(more, size)[:n], 1.0 / log.rate_hz)
+    more = beyond_slow(_from_start(over_bed), f_hz) * accel
+    if as_felt:
+        level = float(np.median(np.abs(over_bed.response[felt.f_hz <= _SLOW_HZ])))
+        on_time = np.exp(2j * np.pi * f_hz * _delay_s(felt)) * np.sinc(f_hz / log.rate_hz) ** 2
+        measured = rfft(log.measured_mm_s2 / log.rate_hz**2, size) * on_time / level
+        if frame is not None:
+            measured *= 1 + frame.reaction(f_hz)
+        rings = 1.0 / (1.0 + (2.0 * np.pi * _RINGS_HZ / log.rate_hz / w) ** _STEEPNESS)
+        more += rings * (measured - accel - more)
+    return bend_of(log.command_mm + irfft(-more / w**2, size)[:n], 1.0 / log.rate_hz)
+
+
+def _delay_s(response: FrequencyResponse) -> float:
+    """Return the delay of a response at low frequency, which is the clock's."""
+    known = response.coherence >= LEAST_COHERENCE
+    if not known.any():
+        return 0.0
+    return low_frequency_delay(response.f_hz[known], response.response[known])
 
 
 def _from_start(response: FrequencyResponse) -> FrequencyResponse:
-    """Return a response without its delay at low frequency, which is the clock's."""
-    known = response.coherence >= LEAST_COHERENCE
-    if not known.any():
-        return response
-    delay_s = low_frequency_delay(response.f_hz[known], response.response[known])
-    turned = response.response * np.exp(2j * np.pi * response.f_hz * delay_s)
-    return replace(response, response=turned)
+    """Return a response without that delay."""
+    turn = np.exp(2j * np.pi * response.f_hz * _delay_s(response))
+    return replace(response, response=response.response * turn)
 
 
-def _held_mm(logs: Sequence[StopsLog], bends: Sequence[Array]) -> float:
-    """Return the size of friction that explains the logs best, 0 where none is clear."""
-    left = np.mean(
-        [
-            [_unexplained(log, log.command_mm - size_mm * bend) for size_mm in SIZES_MM]
-            for log, bend in zip(logs, bends, strict=True)
-        ],
-        axis=0,
-    )
-    if left[0] - left.min() <= CLEARLY:
-        return 0.0
-    return min(lowest_size(left), MOST_FRICTION_MM)
+def _held_mm(
+    logs: Sequence[StopsLog], felt: Sequence[FrequencyResponse], frame: Frame | None
+) -> tuple[float, list[Array]]:
+    """Return the size of friction that explains the logs best, and the bends; 0 if none is clear.
+
+    Guides rub on the frame, but what is taken for one may be none, and what rings may be lost in a
+    noisy log: of the motions that the axis may have made, the one that explains most counts.
+    """
+    best, least = (0.0, [np.zeros(len(log.command_mm)) for log in logs]), -CLEARLY
+    for shaken in (None,) if frame is None else (None, frame):
+        for as_felt in (True, False):
+            bends = [
+                _bend(log, one, shaken, as_felt=as_felt)
+                for log, one in zip(logs, felt, strict=True)
+            ]
+            left = _left(logs, bends)
+            if left.min() - left[0] < least:
+                least = float(left.min() - left[0])
+                best = (min(lowest_size(left), MOST_FRICTION_MM), bends)
+    return best
+
+
+def _left(logs: Sequence[StopsLog], bends: Sequence[Array]) -> Array:
+    """Return what is unexplained with friction of `SIZES_MM`, the mean over the logs."""
+    every = [
+        [_unexplained(log, log.command_mm - size_mm * bend) for size_mm in SIZES_MM]
+        for log, bend in zip(logs, bends, strict=True)
+    ]
+    return np.asarray(np.mean(every, axis=0), np.float64)
 
 
 def _check_followed(response: FrequencyResponse) -> None:

@@ -21,7 +21,7 @@ from stillpath.models.document import Document
 from stillpath.models.machine import Machine
 from stillpath.service.deliveries.findings import Finding, changes, findings, relevant
 from stillpath.service.deliveries.http_requests import Unanswered, Unreached
-from stillpath.service.deliveries.moonraker import NotReady, ask, kind_there
+from stillpath.service.deliveries.moonraker import NotReady, PrinterState, ask, kind_there
 from stillpath.service.deliveries.printers import Printer
 from stillpath.service.deliveries.targets import TargetRefused
 
@@ -111,17 +111,7 @@ class Checker:
         PrinterUnknown
             If it cannot be asked; nothing is known of it then.
         """
-        if printer.kind != "moonraker":
-            _check_kind(printer)
-            raise PrinterUnknown(
-                f"{printer.name} is an OctoPrint, which cannot tell what Klipper's configuration "
-                "says; check by hand (`stillpath machines check NAME --printer-cfg FILE`)"
-            )
-        try:
-            asked = ask(printer)
-        except (Unreached, Unanswered, TargetRefused, NotReady) as error:
-            _check_kind(printer, answers=not isinstance(error, Unreached))
-            raise PrinterUnknown(f"{printer.name} cannot be asked: {error}") from error
+        asked = _asked(printer)
         found = findings(machine, asked, method=method or printer.method or DEFAULT_METHOD)
         now = _Remembered(
             printer=printer.name,
@@ -180,6 +170,21 @@ class Checker:
                 f"{self._documents.place(path)} is damaged; delete it, and the printer's "
                 "configuration as it is then counts"
             ) from None
+
+
+def _asked(printer: Printer) -> PrinterState:
+    """Return what a printer says; raise PrinterUnknown if it cannot be asked."""
+    if printer.kind != "moonraker":
+        _check_kind(printer)
+        raise PrinterUnknown(
+            f"{printer.name} is an OctoPrint, which cannot tell what Klipper's configuration "
+            "says; check by hand (`stillpath machines check NAME --printer-cfg FILE`)"
+        )
+    try:
+        return ask(printer)
+    except (Unreached, Unanswered, TargetRefused, NotReady) as error:
+        _check_kind(printer, answers=not isinstance(error, Unreached))
+        raise PrinterUnknown(f"{printer.name} cannot be asked: {error}") from error
 
 
 def _check_kind(printer: Printer, *, answers: bool = True) -> None:

@@ -304,7 +304,8 @@ class JobStore:
                 return None
             before, row = to_row(job), to_row(after)
             changed = {name: value for name, value in row.items() if value != before[name]}
-            connection.execute(update(tables.jobs).where(_JOBS.id == job_id).values(changed))
+            if changed:  # an update without columns is no SQL
+                connection.execute(update(tables.jobs).where(_JOBS.id == job_id).values(changed))
             if after.state.is_final:
                 _note_deliveries(connection, after)
         return after

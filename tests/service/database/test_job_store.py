@@ -116,6 +116,13 @@ def test_a_beat_is_a_progress_in_one_statement(store: JobStore, sequence: list[E
         assert getattr(first, name) == getattr(second, name)
 
 
+def test_an_event_that_changes_nothing_is_no_fault(store: JobStore):
+    job = store.add(make_job())
+    run(store, job, 1500.0)
+    again = [store.apply(job.id, Progressed(1, 1510.0, "planning", 0.5, None)) for _ in range(2)]
+    assert again[0] == again[1]
+
+
 def test_a_stage_with_the_name_of_a_file_is_cut(store: JobStore):
     job = store.add(make_job())
     run(store, job, 1500.0)
