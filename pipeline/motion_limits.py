@@ -138,21 +138,27 @@ class MotionLimits:
         The file may accelerate more than the command may, or a firmware with few moves in its
         queue stay below their speed.
         """
+        asked = self.asked_too_much(piece)
+        name = _SHORT_QUEUES.get(self._machine.firmware.kind)
+        if asked or name is None:
+            return asked
+        return (
+            f"; {name} does not reach the speed of short moves where command.accel_mm_s2 "
+            f"({self._machine.command.accel_mm_s2:g}) is low: raise it to what the motors bear "
+            "(docs/safety.md)"
+        )
+
+    def asked_too_much(self, piece: Piece) -> str:
+        """Return that the file itself accelerates more than the command may, or ""."""
+        if self._machine.firmware.kind == "marlin":
+            return ""  # its phases stand for ramps of whole steps, with accelerations of their own
         command, phases = self._machine.command, piece.phases
-        kind = self._machine.firmware.kind
         xy_mm_s2 = np.abs(phases.direction[:, :2]) * phases.accel_mm_s2[:, None]
         limits = command.of("x").accel_mm_s2, command.of("y").accel_mm_s2
         for axis, asked, limit in zip("XY", xy_mm_s2.max(axis=0, initial=0.0), limits, strict=True):
-            # Marlin's phases stand for ramps of whole steps, with accelerations of their own.
-            if kind != "marlin" and asked > _SLACK * limit:
+            if asked > _SLACK * limit:
                 return (
                     f"; as sliced, {axis} accelerates by {asked:.0f} mm/s2, more than the "
                     f"command may ({limit:g}, command.accel_mm_s2): {_LOWER}"
                 )
-        name = _SHORT_QUEUES.get(kind)
-        if name is None:
-            return ""
-        return (
-            f"; {name} does not reach the speed of short moves where command.accel_mm_s2 "
-            f"({command.accel_mm_s2:g}) is low: raise it to what the motors bear (docs/safety.md)"
-        )
+        return ""

@@ -130,7 +130,10 @@ class PieceCompensator:
         if self.compensator.ease(0.0):
             with contextlib.suppress(TooAbrupt, DesignError):
                 return self._compensate_once(piece)
-        raise refusals[0]
+        first = refusals[0]
+        if isinstance(first, DesignError):
+            raise DesignError(f"{first}{self._limits.asked_too_much(piece)}") from first
+        raise first
 
     def _operate_at(self, point: OperatingPoint) -> None:
         self.compensator.operate_at(point)

@@ -163,8 +163,15 @@ def test_machines_that_state_nothing_of_it_keep_their_revision() -> None:
     assert load_machine("voron-v0").revision == "843c3eba6432"
 
 
-def test_a_slicer_that_accelerates_more_than_the_motors_bear_is_told_so() -> None:
+@pytest.mark.parametrize(
+    ("borne_mm_s2", "asked_mm_s2", "words"),
+    [(4500, 7000, "planned by the firmware's rules"), (750, 3000, "even the gentlest design")],
+)
+def test_a_slicer_that_accelerates_more_than_the_motors_bear_is_told_so(
+    borne_mm_s2: float, asked_mm_s2: float, words: str
+) -> None:
     """Klipper obeys M204 above max_accel, from which the motors' limits are derived."""
-    machine = with_command(load_machine("ender3"), accel_mm_s2=4500)
-    with pytest.raises(Unfit, match=r"as sliced, X .*: slice with less of it, or raise"):
-        compensated(f"{HEAD}M204 S7000\n{ZIGZAG}", machine)
+    machine = with_command(load_machine("ender3"), accel_mm_s2=borne_mm_s2)
+    remedy = f"as sliced, X accelerates by {asked_mm_s2} .*: slice with less of it, or raise"
+    with pytest.raises(Unfit, match=f"{words}.*{remedy}"):
+        compensated(f"{HEAD}M204 S{asked_mm_s2}\n{ZIGZAG}", machine)
