@@ -28,7 +28,8 @@ _XYZ = np.array([True, True, True, False])
 _STILL = re.compile(rb"\s*(?:N\d+\s*)?G-?0*[0-35](?!\d).*[XYZEIJK]", re.IGNORECASE)
 _TIMES = re.compile(
     rb"M73 |;TIME|;PRINT\.TIME|;Print Time|;PRINTING_TIME|;REMAINING_TIME|; estimated |; model "
-    rb"|; (?:Calculated|Estimated)\S+ Build Time|; --- print time|;estimated_time"
+    rb"|; (?:Calculated|Estimated)\S+ Build Time|; --- print time|;estimated_time|;file_total_lines"
+    rb"|;   Build [Tt]ime"
 )
 _OWN = (b"; stillpath: ", b"; stillpath, held back: ", b"; Processed by stillpath ")
 _DUSTY = ({-1, EventKind.MODE}, {-1, EventKind.UNKNOWN})
