@@ -6,8 +6,8 @@ response is known from 4 Hz to beyond the modes, with its phase but for the cloc
 clock's rate was matched with plants that are not known yet; the right one explains most.
 
 Where the axis reverses, dry friction holds it back on the other side. The stops are so short that
-what rings reverses it, too, so the bend of the guides follows the motion as it was felt. Its size
-is the one that leaves the smallest residual.
+what rings reverses it, too, so the bend of the guides follows the motion as it was felt, or as the
+response has it where a noisy log tells less. Motion and size are those of the smallest residual.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ _SHAKES = 0.4
 _RINGS_HZ, _STEEPNESS = 12.0, 8
 """From where on the bend of the guides follows the motion as it was felt."""
 _ROUNDS = 2
-"""The bend of the guides follows a motion that is the better known the less friction is in it."""
+"""Response and frame are better known once friction is out of them; more rounds change nothing."""
 
 
 @dataclass(frozen=True, slots=True)
